@@ -1,0 +1,38 @@
+# Two commands set everything up on a machine with Python 3.11 and nothing else:
+#   make demo   fly, learn, land, upload, fly again, on a simulated aircraft over real UDP
+#   make test   ruff, mypy --strict and every test
+# Both make their own environment in .venv; nothing touches the system Python.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+UV_VERSION := 0.13.9
+export UV_PROJECT_ENVIRONMENT := $(CURDIR)/$(VENV)
+
+.PHONY: demo test check soak bench clean
+
+$(VENV)/.ready: pyproject.toml uv.lock
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
+	  { rm -rf $(VENV); echo "python3-venv is missing: installing it" >&2; \
+	    apt-get update -qq && apt-get install -y -qq python3-venv && $(PYTHON) -m venv $(VENV); }
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	@$(BIN)/uv sync --quiet --frozen --inexact
+	@touch $@
+
+demo: $(VENV)/.ready
+	$(BIN)/magmav demo --out demo
+
+test: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest -n 2
+
+soak: $(VENV)/.ready
+	$(BIN)/python benchmarks/soak.py
+
+bench: $(VENV)/.ready
+	$(BIN)/python benchmarks/throughput.py
+
+clean:
+	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

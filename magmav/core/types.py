@@ -1,0 +1,405 @@
+"""Every record that travels, frozen and checked once, where it is made.
+
+Vectors are float64 arrays of shape (3,), read-only, body axes (forward, right, down) unless the name says
+otherwise: ``_b_`` body, ``_n_`` north-east-down, ``_l_`` levelled (body with roll and pitch undone).
+Field strength is in milligauss (``_mg``), angles and rates in radians, specific force in m/s^2.
+``boot_ns`` is the vehicle's own clock; ``t_ns`` and ``now_ns`` are arrival times of the link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vec3 = NDArray[np.float64]
+Mat3 = NDArray[np.float64]
+
+
+def vec3(value: object, name: str) -> Vec3:
+    """A finite, read-only float64 array of shape (3,); ValueError naming the culprit otherwise."""
+    out = np.array(value, dtype=np.float64)
+    if out.shape != (3,) or not np.isfinite(out).all():
+        raise ValueError(f"{name}: want 3 finite numbers, got {value!r}")
+    out.flags.writeable = False
+    return out
+
+
+def mat3(value: object, name: str) -> Mat3:
+    """A finite, read-only float64 array of shape (3, 3); ValueError naming the culprit otherwise."""
+    out = np.array(value, dtype=np.float64)
+    if out.shape != (3, 3) or not np.isfinite(out).all():
+        raise ValueError(f"{name}: want a finite 3 x 3 matrix, got {value!r}")
+    out.flags.writeable = False
+    return out
+
+
+ZERO3 = vec3((0, 0, 0), "zero")
+IDENTITY3 = mat3(np.eye(3), "identity")
+
+
+# ---------------------------------------------------------------- readings: what one message said
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagReading:
+    """One magnetometer triple as it was sent, already in mG and body axes, corrected or not by the sender."""
+
+    system: int
+    compass: int  # 1, 2 or 3
+    source: str  # message name, so that one compass seen through two messages is not two compasses
+    boot_ns: int
+    field_b_mg: Vec3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialReading:
+    """Accelerometer (specific force, so level and still is -g on z) and gyro of one IMU, body axes."""
+
+    system: int
+    source: str
+    boot_ns: int
+    force_b_mss: Vec3
+    rate_b_rads: Vec3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeReading:
+    """The autopilot's attitude. Yaw is true north, and on most vehicles follows the compass: never a measurement."""
+
+    system: int
+    source: str
+    boot_ns: int
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    rate_b_rads: Vec3
+
+
+@dataclass(frozen=True, slots=True)
+class PositionReading:
+    """Where the vehicle is (GLOBAL_POSITION_INT, or GPS_RAW_INT with a 3-D fix)."""
+
+    system: int
+    source: str
+    boot_ns: int
+    lat_deg: float
+    lon_deg: float
+    alt_m: float  # above mean sea level
+
+
+@dataclass(frozen=True, slots=True)
+class MotionReading:
+    """How the vehicle moves over ground; height is above home and only as good as the sender's home."""
+
+    system: int
+    boot_ns: int
+    north_mps: float
+    east_mps: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentReading:
+    """Battery current; the sender knows it (unknown is no reading)."""
+
+    system: int
+    source: str
+    ampere: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThrottleReading:
+    """Throttle as a share of full, 0 to 1."""
+
+    system: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class TimeReading:
+    """The vehicle's boot clock against UNIX time, when it knows it."""
+
+    system: int
+    boot_ns: int
+    unix_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleReading:
+    """An autopilot's heartbeat."""
+
+    system: int
+    component: int
+    autopilot: int  # MAV_AUTOPILOT
+    kind: int  # MAV_TYPE
+    armed: bool
+    status: int  # MAV_STATE
+
+
+class Landed(IntEnum):
+    """MAV_LANDED_STATE, the values that say something."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKING_OFF = 3
+    LANDING = 4
+
+
+@dataclass(frozen=True, slots=True)
+class LandedReading:
+    """EXTENDED_SYS_STATE when the landed state is known."""
+
+    system: int
+    state: Landed
+
+
+@dataclass(frozen=True, slots=True)
+class ParamReading:
+    """One parameter the autopilot says it holds, float32 widened; index 65535 marks an echo."""
+
+    system: int
+    component: int
+    name: str
+    value: float
+    index: int
+    count: int
+
+
+Reading = (
+    MagReading
+    | InertialReading
+    | AttitudeReading
+    | PositionReading
+    | MotionReading
+    | CurrentReading
+    | ThrottleReading
+    | TimeReading
+    | VehicleReading
+    | LandedReading
+    | ParamReading
+)
+
+
+# ---------------------------------------------------------------- reasons: why a result is as it is
+
+
+class Reason(Enum):
+    """Every reason a result or a refusal can carry: a stable name, a number for the wire, a plain sentence."""
+
+    NO_COMPASS = (1, "no magnetometer data seen")
+    NO_ATTITUDE = (2, "no ATTITUDE: tilt comes from accelerometer and gyro")
+    NO_POSITION = (3, "no position: expected field and declination unknown, heading is magnetic")
+    RELATIVE_ONLY = (4, "stored offsets or device id unknown: result is a change relative to them")
+    ASSUMED_DEFAULT = (5, "matrix, scale or motor terms not seen: autopilot defaults assumed")
+    NOT_FLYING = (6, "waiting for take-off: data on the ground is not learnt from")
+    TOO_LITTLE_DATA = (7, "not enough distinct samples yet")
+    X_NOT_OBSERVED = (8, "forward axis not observed: turn the vehicle")
+    Y_NOT_OBSERVED = (9, "right axis not observed: turn the vehicle")
+    Z_NOT_OBSERVED = (10, "down axis not observed: bank or pitch the vehicle")
+    Z_FROM_MODEL = (11, "down axis rests on the field model, not on motion")
+    STILL_MOVING = (12, "estimate still changing more than its sigma")
+    JUST_CHANGED = (13, "field changed suddenly a moment ago, learning again")
+    FIELD_NOT_EARTHLIKE = (14, "corrected field strength does not fit the Earth's: magnet or steel near compass")
+    RESIDUAL_TOO_LARGE = (15, "readings scatter too much around the fit")
+    HEADING_UNSURE = (16, "heading sigma too large")
+    HORIZONTAL_WEAK = (17, "horizontal field under 100 mG: a compass is weak here")
+    PARAMETERS_CHANGED = (18, "compass parameters changed: data before is not used")
+    STALE = (19, "no fresh magnetometer data")
+    FROZEN = (20, "magnetometer value never changes: sensor stuck")
+    NO_CALIBRATION = (21, "no calibration that is ready for this compass")
+    ARMED = (30, "vehicle is armed")
+    NOT_LANDED = (31, "vehicle is not known to be on the ground")
+    HEARTBEAT_OLD = (32, "no heartbeat in the last 1.2 s over this route")
+    SECOND_WRITER = (33, "another calibration or learning mode is active")
+    DEVICE_CHANGED = (34, "device id differs from the one estimated")
+    OFFSETS_CHANGED = (35, "stored offsets changed since the estimate")
+    BEYOND_LIMIT = (36, "an offset is beyond the allowed range")
+    CONFIRM_CHANGE = (37, "change above 150 mG wants the confirmation code")
+    UNKNOWN_PARAM = (38, "autopilot did not answer for a parameter")
+    NOT_OBSERVED = (39, "no axis is observed well enough to write")
+    NOTHING_TO_DO = (40, "stored offsets already are the right ones")
+    BUSY = (41, "another upload or restore is running")
+    UNPROVEN = (42, "corrected field did not move as predicted: old values restored")
+    NO_STREAM = (43, "no magnetometer stream to prove the change with")
+    WRONG_VEHICLE = (44, "not the vehicle this was made for")
+    NO_SNAPSHOT = (45, "no earlier values on record to restore")
+    SECOND_ROUTE = (46, "the same autopilot is claimed over a second route")
+    LINK_LOST = (47, "link to the vehicle was lost")
+    NOT_SUPPORTED = (48, "upload to this autopilot is not supported yet")
+
+    def __init__(self, number: int, text: str) -> None:
+        self.number = number
+        self.text = text
+
+
+# ---------------------------------------------------------------- what core is given and gives back
+
+
+class EarthField(NamedTuple):
+    """The Earth's field where the vehicle is, mG, true north-east-down."""
+
+    north_mg: float
+    east_mg: float
+    down_mg: float
+
+
+FieldModel = Callable[[float, float, float, int], EarthField | None]
+"""(latitude deg, longitude deg, altitude m, UNIX ns) -> field, or None outside the model's years."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shaping:
+    """What the autopilot does after adding offsets: truth = matrix @ (sensor - hard iron) + motor.
+
+    matrix : (3, 3), scale and soft-iron matrix in one.  motor_b_mg : (3,), mG, what the autopilot adds last.
+    Fitted through, never changed (users.md N16).
+    """
+
+    matrix: Mat3
+    motor_b_mg: Vec3
+
+
+NO_SHAPING = Shaping(IDENTITY3, ZERO3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One fresh magnetometer value with the motion that belongs to it. Estimators see nothing else.
+
+    mag_b_mg is the sensor's own field, body axes, with all the autopilot's corrections undone.
+    rate_b_rads and the tilt are those at boot_ns. yaw_step_rad is the change of heading since the previous sample of
+    this compass, from body rates only. gap is True where that step cannot be trusted (first sample, silence, reboot).
+    """
+
+    system: int
+    compass: int
+    boot_ns: int
+    dt_s: float
+    mag_b_mg: Vec3
+    shaping: Shaping
+    rate_b_rads: Vec3
+    roll_rad: float
+    pitch_rad: float
+    yaw_step_rad: float
+    gap: bool
+    tilt_from: str  # "ATTITUDE" or "OWN"
+    learn: bool  # False on time that teaches nothing: on the ground, settling after a parameter change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """What one estimator believes about one compass.
+
+    hard_iron_b_mg : (3,) mG, the sensor's own axes, SUBTRACT it (ArduPilot adds its negative).
+    covariance_mg2 : (3, 3) with everything used; own_sigma_mg : (3,) from motion alone, without the field model.
+    field_l_mg : (2,) horizontal and downward field the data imply, mG; residual_mg : RMS of the fit, mG.
+    step_nis : normalised innovation squared per axis, averaged over the last seconds (1 is ideal).
+    """
+
+    hard_iron_b_mg: Vec3
+    covariance_mg2: Mat3
+    own_sigma_mg: Vec3
+    horizontal_mg: float
+    down_mg: float
+    residual_mg: float
+    step_nis: float
+    samples: int
+    changed_ago_s: float  # seconds since the last sudden change was accepted; large when never
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """Heading of the corrected compass. A value whose flag is False means nothing and is never shown."""
+
+    valid: bool
+    true_valid: bool
+    magnetic_rad: float
+    true_rad: float
+    sigma_rad: float
+
+
+class AxisState(Enum):
+    """How well one axis of the hard iron is known."""
+
+    OBSERVED = "OBSERVED"
+    FROM_MODEL = "FROM_MODEL"
+    NOT_OBSERVED = "NOT_OBSERVED"
+
+
+class State(IntEnum):
+    """MMAG_STATE."""
+
+    NO_DATA = 0
+    LEARNING = 1
+    READY = 2
+    REFUSED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """May this estimate be written to the vehicle, and why (not)."""
+
+    state: State
+    axes: tuple[AxisState, AxisState, AxisState]
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """What was known after one sample: the one thing views see."""
+
+    t_ns: int
+    system: int
+    compass: int
+    device_id: int  # 0 when not known
+    boot_ns: int
+    mag_b_mg: Vec3
+    corrected_b_mg: Vec3  # after the estimate
+    stored_b_mg: Vec3  # after what the autopilot holds, as it streams it
+    roll_rad: float
+    pitch_rad: float
+    estimate: Estimate
+    offsets_mg: Vec3  # as ArduPilot would add them
+    sigma_mg: Vec3
+    heading: Heading
+    stored_heading: Heading
+    verdict: Verdict
+    learnt: bool  # this sample moved the estimate
+
+
+# ---------------------------------------------------------------- writing to a vehicle
+
+
+class UploadResult(Enum):
+    """How a write ended. The number is MMAG_RESULT."""
+
+    ALL_NEW = 2
+    ALL_OLD = 3
+    WRITTEN_UNPROVEN = 4
+    PENDING_RESTORE = 5
+    REFUSED = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A wish to change one compass's offsets, and what it was based on. Values are float32 exact.
+
+    names, old and new run in parallel, in the autopilot's own names, units and frame. shift_b_mg is how the
+    corrected stream must move once the change works, body axes, mG. device_name is the parameter holding device_id.
+    """
+
+    system: int
+    compass: int
+    device_name: str
+    device_id: int
+    names: tuple[str, ...]
+    old: tuple[float, ...]
+    new: tuple[float, ...]
+    shift_b_mg: tuple[float, float, float]
+    shift_sigma_mg: tuple[float, float, float]
+    step_mg: tuple[float, ...]  # |new - old| per name in mG, for the limits
