@@ -1,8 +1,8 @@
 """Bytes in and out, and the only place with a clock.
 
-A link yields packets for as long as it lives, and a quiet tick (empty bytes) when nothing came, so that whoever
-turns the crank always knows what time it is. Nobody else may ask. Sources are peers: live sockets, recorded files
-and the in-memory pair keep the same contract, and damage is a wrapper around any of them.
+A link yields packets for as long as it lives, and a quiet tick (empty bytes) when nothing came, so that
+whoever turns the crank always knows what time it is. Nobody else may ask. Sources are peers: live sockets,
+recorded files and the in-memory pair keep the same contract, and damage is a wrapper around any of them.
 """
 
 from __future__ import annotations
