@@ -76,8 +76,8 @@ def row(record: Record) -> Row:
     known = verdict.state is not State.NO_DATA
     true = heading.valid and heading.true_valid
     values: list[Value] = [
-        round(record.t_ns * 1e-9, 6),
-        round(record.boot_ns * 1e-9, 6),
+        round(record.t_ns / 1e9, 6),
+        round(record.boot_ns / 1e9, 6),
         record.system,
         record.compass,
         record.device_id or None,
