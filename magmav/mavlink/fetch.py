@@ -1,0 +1,107 @@
+"""Read the parameters we need by name, a few at a time; never the vehicle's full list (S14).
+
+ArduPilot 4.5 says nothing about a name it does not have, newer ones send PARAM_ERROR. Silence after four
+requests means absent, with one late second chance, since silence may also have been the link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.presence import Presence
+
+_SECOND = 1_000_000_000
+SPACING_NS = _SECOND // 10
+RETRY_NS = _SECOND
+TRIES = 4
+SECOND_CHANCE_NS = 30 * _SECOND
+
+
+@dataclass(slots=True)
+class _Name:
+    heard: bool = False
+    absent: bool = False
+    tries: int = 0
+    due_ns: int = 0
+
+
+class ParamFetch:
+    """names : parameters of the autopilot. The values themselves are for whoever decodes PARAM_VALUE."""
+
+    def __init__(self, names: Sequence[str], presence: Presence) -> None:
+        for name in names:
+            if not 1 <= len(name) <= 16 or not name.isascii():
+                raise ValueError(f"names: {name!r} is no parameter name of 1 to 16 characters")
+        self._presence = presence
+        self._state = {name: _Name() for name in names}
+        self._next_ns = 0
+        self._key: tuple[int, int, str, int] | None = None
+
+    @property
+    def heard(self) -> frozenset[str]:
+        """Names whose value was seen since the last start."""
+        return frozenset(name for name, state in self._state.items() if state.heard)
+
+    @property
+    def absent(self) -> frozenset[str]:
+        """Names the vehicle does not seem to have."""
+        return frozenset(name for name, state in self._state.items() if state.absent)
+
+    @property
+    def done(self) -> bool:
+        """Everything is either heard or absent."""
+        return all(state.heard or state.absent for state in self._state.values())
+
+    def restart(self) -> None:
+        """Read all again: the vehicle rebooted, its offsets may be others now."""
+        self.again(tuple(self._state))
+
+    def again(self, names: Iterable[str]) -> None:
+        """Read these again, and add those that were not wanted before."""
+        for name in names:
+            self._state[name] = _Name()
+
+    def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
+        """Tick off what the autopilot says, asked for or not."""
+        autopilot = self._presence.autopilot
+        sender = message.get_srcSystem(), message.get_srcComponent(), route
+        if autopilot is None or sender != autopilot.pin:
+            return []
+        kind = message.get_type()
+        if kind in ("PARAM_VALUE", "PARAM_ERROR") and message.param_id in self._state:
+            state = self._state[message.param_id]
+            if kind == "PARAM_VALUE":
+                state.heard, state.absent = True, False
+            elif message.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST and not state.heard:
+                state.absent, state.tries = True, TRIES + 1  # it said so: no second chance needed
+        return self.poll(now_ns)
+
+    def poll(self, now_ns: int) -> list[Outgoing]:
+        """At most one request, and at most ten a second."""
+        autopilot = self._presence.autopilot
+        if autopilot is None:
+            return []
+        key = (*autopilot.pin, self._presence.boots)
+        if self._key is not None and key[3] != self._key[3]:
+            self.restart()
+        self._key = key
+        if now_ns < self._next_ns:
+            return []
+        for name, state in self._state.items():
+            if state.heard or state.tries > TRIES or now_ns < state.due_ns:
+                continue
+            if state.tries == TRIES and not state.absent:
+                state.absent, state.due_ns = True, now_ns + SECOND_CHANCE_NS
+                continue
+            state.tries += 1
+            state.due_ns = now_ns + RETRY_NS
+            self._next_ns = now_ns + SPACING_NS
+            message = dialect.MAVLink_param_request_read_message(
+                autopilot.system, autopilot.component, name.encode("ascii"), -1
+            )
+            return [Outgoing(message, autopilot.route)]
+        return []

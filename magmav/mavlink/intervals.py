@@ -1,0 +1,164 @@
+"""Ask the autopilot for the messages we live on, at the rate we need, and give them back when we leave.
+
+The answer (COMMAND_ACK) does not say which message it is about, so requests go out one at a time. ArduPilot
+applies an interval to the channel the command came in on, so a new route or a reboot starts everything over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.presence import Autopilot, Presence
+
+_SECOND = 1_000_000_000
+ACK_NS = _SECOND
+TRIES = 4
+WINDOW_NS = 5 * _SECOND
+FIRST_PAUSE_NS = 10 * _SECOND
+LAST_PAUSE_NS = 80 * _SECOND
+_IDS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
+_REFUSED = (dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_UNSUPPORTED)
+
+
+@dataclass(slots=True)
+class _Stream:
+    interval_us: int
+    hz: float
+    count: int = 0
+    rate_hz: float = math.nan  # over the last window
+    tries: int = 0  # of the first request
+    next_ns: int = 0  # no request before
+    pause_ns: int = FIRST_PAUSE_NS
+    refused: bool = False
+    changed: bool = False  # we sent at least one request
+
+
+class Intervals:
+    """wanted : message name -> Hz. ``rates`` tells what really comes, over the last five seconds."""
+
+    def __init__(self, wanted: Mapping[str, float], presence: Presence) -> None:
+        for name, hz in wanted.items():
+            if name not in _IDS:
+                raise ValueError(f"wanted: no message is called {name!r}")
+            if not (math.isfinite(hz) and hz > 0):
+                raise ValueError(f"wanted: {name} wants a rate above 0 Hz, got {hz!r}")
+        self._wanted = dict(wanted)
+        self._presence = presence
+        self._key: tuple[int, int, str, int] | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget answers and rates, and request everything again: the vehicle rebooted or moved."""
+        self._streams = {name: _Stream(round(1e6 / hz), hz) for name, hz in self._wanted.items()}
+        self._queue = deque(self._streams)
+        self._waiting = ""
+        self._sent_ns = 0
+        self._window_ns: int | None = None
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Hz per wanted message over the last whole window, NaN before there was one."""
+        return {name: stream.rate_hz for name, stream in self._streams.items()}
+
+    @property
+    def refused(self) -> frozenset[str]:
+        """Messages the autopilot said it does not have."""
+        return frozenset(name for name, stream in self._streams.items() if stream.refused)
+
+    def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
+        """Count what comes; an acknowledgement frees the way for the next request."""
+        autopilot = self._presence.autopilot
+        sender = message.get_srcSystem(), message.get_srcComponent(), route
+        if autopilot is None or sender != autopilot.pin:
+            return []
+        kind = message.get_type()
+        if kind in self._streams:
+            self._streams[kind].count += 1
+        elif kind == "COMMAND_ACK" and self._waiting and self._is_ours(message):
+            stream = self._streams[self._waiting]
+            stream.refused = message.result in _REFUSED
+            self._waiting = ""
+        return self.poll(now_ns)
+
+    def poll(self, now_ns: int) -> list[Outgoing]:
+        """At most one request."""
+        autopilot = self._presence.autopilot
+        if autopilot is None:
+            return []
+        key = (*autopilot.pin, self._presence.boots)
+        if key != self._key:
+            if self._key is not None:
+                self.restart()
+            self._key = key
+        self._measure(now_ns)
+        if self._waiting:
+            if now_ns - self._sent_ns < ACK_NS:
+                return []
+            if self._streams[self._waiting].tries < TRIES:
+                self._queue.appendleft(self._waiting)
+            self._waiting = ""
+        return [self._request(autopilot, self._queue.popleft(), now_ns)] if self._queue else []
+
+    def restore(self) -> list[Outgoing]:
+        """Default intervals again for everything we changed (S14); for the way out."""
+        autopilot = self._presence.autopilot
+        if autopilot is None:
+            return []
+        changed = [name for name, stream in self._streams.items() if stream.changed and not stream.refused]
+        for name in changed:
+            self._streams[name].changed = False
+        return [_command(autopilot, name, 0) for name in changed]
+
+    def _request(self, autopilot: Autopilot, name: str, now_ns: int) -> Outgoing:
+        stream = self._streams[name]
+        stream.tries += 1
+        stream.changed = True
+        stream.next_ns = now_ns + stream.pause_ns
+        self._waiting, self._sent_ns = name, now_ns
+        return _command(autopilot, name, stream.interval_us)
+
+    def _measure(self, now_ns: int) -> None:
+        """Every five seconds: what is under half its rate is asked for again, ever more rarely."""
+        if self._window_ns is None:
+            self._window_ns = now_ns
+        span_ns = now_ns - self._window_ns
+        if span_ns < WINDOW_NS:
+            return
+        for name, stream in self._streams.items():
+            stream.rate_hz = stream.count * _SECOND / span_ns
+            stream.count = 0
+            if stream.rate_hz >= stream.hz / 2:
+                stream.pause_ns = FIRST_PAUSE_NS
+                continue
+            asking = name == self._waiting or name in self._queue
+            if stream.refused or asking or stream.tries == 0 or now_ns < stream.next_ns:
+                continue
+            stream.tries = TRIES  # no quick repeats any more
+            self._queue.append(name)
+            stream.next_ns = now_ns + stream.pause_ns
+            stream.pause_ns = min(2 * stream.pause_ns, LAST_PAUSE_NS)
+        self._window_ns = now_ns
+
+    def _is_ours(self, ack: Message) -> bool:
+        ours = ack.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+        to_us = ack.target_system in (0, self._presence.system)
+        return ours and to_us and ack.target_component in (0, self._presence.component)
+
+
+def _command(autopilot: Autopilot, name: str, interval_us: int) -> Outgoing:
+    message = dialect.MAVLink_command_long_message(
+        autopilot.system,
+        autopilot.component,
+        dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+        0,
+        _IDS[name],
+        interval_us,
+        *(0,) * 5,
+    )
+    return Outgoing(message, autopilot.route)
