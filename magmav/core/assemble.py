@@ -1,0 +1,179 @@
+"""Readings to Samples: one fresh magnetometer value with the tilt and turning that belong to it.
+
+Per vehicle. Duplicates, reordering, gaps, reboots and clock jumps are handled here and counted, so that an estimator
+never meets them. Two clocks are never mixed: everything here is the vehicle's boot time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from magmav.core.motion import Motion
+from magmav.core.types import AttitudeReading, InertialReading, MagReading, Sample, Shaping, Vec3
+
+_BACK_NS = 2_000_000_000  # further back than any reordering: a reboot
+_AHEAD_NS = 10_000_000_000  # further ahead than any pause worth bridging: a clock jump
+_NEAR_NS = 5_000_000_000  # a second message this close after the first confirms a new timeline
+_GAP_S = 0.5
+_SOURCE_SILENT_NS = 2_000_000_000
+_PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")
+
+
+class Tick(Enum):
+    """What a boot time says about the vehicle's clock."""
+
+    GOES_ON = "goes on"
+    REBOOT = "reboot"
+    JUMP = "clock jump"
+    DOUBT = "doubt"  # too far off to be used until a second message agrees
+
+
+class BootClock:
+    """Follows one vehicle's boot time. A jump is believed when a second, later message confirms it."""
+
+    def __init__(self) -> None:
+        self.latest_ns: int | None = None
+        self._doubt_ns: int | None = None
+
+    def hear(self, boot_ns: int) -> Tick:
+        """Take one boot time and say how it continues the story."""
+        if self.latest_ns is None:
+            self.latest_ns = boot_ns
+            return Tick.GOES_ON
+        ahead = boot_ns - self.latest_ns
+        if -_BACK_NS <= ahead <= _AHEAD_NS:
+            self.latest_ns = max(self.latest_ns, boot_ns)
+            self._doubt_ns = None if ahead > 0 else self._doubt_ns
+            return Tick.GOES_ON
+        if self._doubt_ns is not None and 0 < boot_ns - self._doubt_ns <= _NEAR_NS:
+            self.latest_ns, self._doubt_ns = boot_ns, None
+            return Tick.REBOOT if ahead < 0 else Tick.JUMP
+        self._doubt_ns = boot_ns
+        return Tick.DOUBT
+
+
+@dataclass(slots=True)
+class _Compass:
+    """What is remembered of one compass between messages."""
+
+    source: str
+    heard_ns: int  # boot time of the last message, fresh or not
+    sent_b_mg: Vec3 | None = None
+    fresh_ns: int = 0
+    yaw_rad: float = 0.0
+    epoch: int = -1
+    turned_rad: float = 0.0  # since the last fresh value
+    restart: bool = True
+
+
+class Assembler:
+    """One vehicle's readings to Samples. ``counts`` says what was dropped and why."""
+
+    def __init__(self, system: int) -> None:
+        self.system = system
+        self.counts: Counter[str] = Counter()
+        self.clock = BootClock()
+        self.motion = Motion()
+        self.reboots = 0
+        self._compasses: dict[int, _Compass] = {}
+
+    def attitude(self, reading: AttitudeReading) -> None:
+        """Take an attitude."""
+        if self._in_time(reading.boot_ns) and not self.motion.attitude(reading):
+            self.counts[f"{reading.source}: duplicate or late"] += 1
+
+    def inertial(self, reading: InertialReading) -> None:
+        """Take accelerometer and gyro: the tilt of a vehicle that sends no attitude."""
+        if self._in_time(reading.boot_ns):
+            self.motion.inertial(reading)
+
+    def frozen_s(self, compass: int) -> float:
+        """Seconds of turning (over 30 degrees) during which this compass never changed its value, else 0."""
+        known = self._compasses.get(compass)
+        if known is None or known.turned_rad < math.radians(30.0):
+            return 0.0
+        return (known.heard_ns - known.fresh_ns) / 1e9
+
+    def restart(self, compass: int) -> None:
+        """The next sample of this compass follows a break: nothing is bridged."""
+        if compass in self._compasses:
+            self._compasses[compass].restart = True
+
+    def mag(self, reading: MagReading, undo: Callable[[Vec3], Vec3], shaping: Shaping, learn: bool) -> Sample | None:
+        """A Sample when this is a fresh value whose tilt is known.
+
+        ``undo`` takes the value as sent back to the sensor's own field; it is called only for fresh values.
+        """
+        if not self._in_time(reading.boot_ns):
+            return None
+        known = self._source(reading)
+        if known is None:
+            return None
+        turning = self.motion.rate_at(reading.boot_ns)
+        known.turned_rad += turning * max(reading.boot_ns - known.heard_ns, 0) / 1e9
+        known.heard_ns = reading.boot_ns
+        if known.sent_b_mg is not None and np.array_equal(reading.field_b_mg, known.sent_b_mg):
+            self.counts["mag: repeated value"] += 1
+            return None
+        state = self.motion.at(reading.boot_ns)
+        if state is None:
+            self.counts["mag: no tilt yet"] += 1
+            return None
+        dt_s = (reading.boot_ns - known.fresh_ns) / 1e9
+        gap = known.restart or dt_s > _GAP_S and not state.bridged or known.epoch != state.epoch
+        if known.sent_b_mg is not None and dt_s > _GAP_S:
+            self.counts["mag: gap"] += 1
+        sample = Sample(
+            system=self.system,
+            compass=reading.compass,
+            boot_ns=reading.boot_ns,
+            dt_s=0.0 if known.restart else dt_s,
+            mag_b_mg=undo(reading.field_b_mg),
+            shaping=shaping,
+            rate_b_rads=state.rate_b_rads,
+            roll_rad=state.roll_rad,
+            pitch_rad=state.pitch_rad,
+            yaw_step_rad=0.0 if gap else state.yaw_rad - known.yaw_rad,
+            gap=gap,
+            tilt_from=state.source,
+            learn=learn,
+        )
+        known.sent_b_mg, known.fresh_ns, known.turned_rad = reading.field_b_mg, reading.boot_ns, 0.0
+        known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False
+        return sample
+
+    def _in_time(self, boot_ns: int) -> bool:
+        tick = self.clock.hear(boot_ns)
+        if tick is Tick.GOES_ON:
+            return True
+        self.counts[f"clock: {tick.value}"] += 1
+        if tick is Tick.DOUBT:
+            return False
+        if tick is Tick.REBOOT:
+            self.reboots += 1
+        self.motion = Motion()
+        self._compasses.clear()
+        return True
+
+    def _source(self, reading: MagReading) -> _Compass | None:
+        """The compass's memory, or None when this message repeats what another one already tells, or comes late."""
+        known = self._compasses.get(reading.compass)
+        if known is None:
+            known = self._compasses[reading.compass] = _Compass(reading.source, reading.boot_ns)
+            return known
+        if reading.source != known.source:
+            better = _PREFERENCE.index(reading.source) < _PREFERENCE.index(known.source)
+            if not better and reading.boot_ns - known.heard_ns < _SOURCE_SILENT_NS:
+                self.counts["mag: same compass in another message"] += 1
+                return None
+            known.source = reading.source
+        elif reading.boot_ns <= known.heard_ns and known.sent_b_mg is not None:
+            self.counts["mag: duplicate" if reading.boot_ns == known.heard_ns else "mag: late"] += 1
+            return None
+        return known

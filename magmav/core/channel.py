@@ -1,0 +1,167 @@
+"""One compass from Sample to answer: estimator, excitation, heading and gate, and the short memory they need."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from magmav.core import gate
+from magmav.core.estimators import Estimator
+from magmav.core.excitation import Excitation
+from magmav.core.field import ExpectedField
+from magmav.core.heading import UNKNOWN, heading, heading_sigma, magnetic_heading
+from magmav.core.types import ZERO3, Estimate, Heading, Sample, State, Vec3, Verdict, vec3
+
+_SIGMA_FLOOR_MG = (1.5, 1.5, 5.0)
+_TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
+_OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
+_FIELD_TAU_S = 5.0
+_VERDICT_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Circumstances:
+    """What the vehicle, rather than the compass, contributes to a verdict."""
+
+    expected: ExpectedField | None
+    relative: bool
+    assumed: bool
+    parameters_changed: bool
+    grounded: bool
+    frozen_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """What is known of one compass after one sample. offsets_mg are to be added by the autopilot (-hard iron)."""
+
+    estimate: Estimate
+    hard_iron_b_mg: Vec3
+    offsets_mg: Vec3
+    sigma_mg: Vec3
+    corrected_b_mg: Vec3
+    heading: Heading
+    stored_heading: Heading
+    verdict: Verdict
+    coverage: float
+
+
+_NO_ESTIMATE = Estimate(ZERO3, np.diag([1e6] * 3), vec3([1e3] * 3, "sigma"), 0.0, 0.0, 0.0, 1.0, 0, 1e9)
+
+
+class Channel:
+    """Learns one compass. ``hold`` keeps the answer as it is while samples go on being judged by it."""
+
+    def __init__(self, make: Callable[[], Estimator], limits: gate.Limits, steady_s: float) -> None:
+        self._make = make
+        self._limits = limits
+        self._steady_s = steady_s
+        self.verdict = gate.NOTHING
+        self.held = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again: what was learnt belongs to another stretch of data."""
+        self._estimator = self._make()
+        self._excitation = Excitation()
+        self._estimate: Estimate | None = None
+        self._past: deque[tuple[int, Vec3]] = deque()
+        self._field_mg = 0.0
+        self._judged_ns: int | None = None
+        self._resume = False
+
+    def step(self, s: Sample, sent_b_mg: Vec3, c: Circumstances) -> Finding:
+        """Take one sample, and the same value as the autopilot sent it."""
+        if self.held:
+            self._resume = True
+        else:
+            self._estimator.step(self._after_hold(s))
+            if s.learn or self._estimate is None:
+                self._estimate = self._estimator.estimate(c.expected)
+        e = self._estimate or _NO_ESTIMATE
+        corrected = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
+        own_heading = magnetic_heading(corrected, s.roll_rad, s.pitch_rad)
+        if s.learn and self._estimate is not None:
+            self._excitation.see(corrected, own_heading)
+            self._follow(s, e, float(np.linalg.norm(corrected)))
+        sigma = gate.floored(e, _SIGMA_FLOOR_MG)
+        down, horizontal = self._field(e, c.expected)
+        covariance = s.shaping.matrix @ e.covariance_mg2 @ s.shaping.matrix.T
+        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
+        heading_sd = heading_sigma(covariance, horizontal, down, s.roll_rad, s.pitch_rad, tilt_sigma)
+        offsets_sd = heading_sigma(covariance, horizontal, down, 0.0, 0.0, 0.0)
+        self._judge(s, c, sigma, offsets_sd)
+        declination = None if c.expected is None else c.expected.declination_rad
+        return Finding(
+            estimate=e,
+            hard_iron_b_mg=e.hard_iron_b_mg,
+            offsets_mg=vec3(-e.hard_iron_b_mg, "offsets"),
+            sigma_mg=sigma,
+            corrected_b_mg=corrected,
+            heading=self._heading(s, corrected, heading_sd, declination),
+            stored_heading=heading(sent_b_mg, s.roll_rad, s.pitch_rad, math.pi, declination),
+            verdict=self.verdict,
+            coverage=self._excitation.coverage,
+        )
+
+    def _after_hold(self, s: Sample) -> Sample:
+        if not self._resume:
+            return s
+        self._resume = False
+        return Sample(**{n: getattr(s, n) for n in s.__slots__ if n != "gap"}, gap=True)
+
+    def _heading(self, s: Sample, corrected: Vec3, sigma_rad: float, declination: float | None) -> Heading:
+        """Published only once the two level axes are known at all: a guess is no heading."""
+        known = self._estimate is not None and sigma_rad < math.radians(45.0)
+        return heading(corrected, s.roll_rad, s.pitch_rad, sigma_rad, declination) if known else UNKNOWN
+
+    @staticmethod
+    def _field(e: Estimate, expected: ExpectedField | None) -> tuple[float, float]:
+        if expected is not None:
+            return expected.down_mg, expected.horizontal_mg
+        return e.down_mg, e.horizontal_mg
+
+    def _follow(self, s: Sample, e: Estimate, field_mg: float) -> None:
+        """Remember where the estimate was, to tell whether it stands still, and how strong the field is."""
+        weight = min(1.0, s.dt_s / _FIELD_TAU_S) if self._field_mg else 1.0
+        self._field_mg += weight * (field_mg - self._field_mg)
+        if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
+            self._past.append((s.boot_ns, e.hard_iron_b_mg))
+        while len(self._past) > 1 and s.boot_ns - self._past[1][0] >= self._steady_s * 1e9:
+            self._past.popleft()
+
+    def _steady(self, boot_ns: int, e: Estimate, sigma_mg: Vec3) -> bool:
+        if not self._past or boot_ns - self._past[0][0] < self._steady_s * 1e9 * 0.9:
+            return False
+        moved = np.abs(e.hard_iron_b_mg - self._past[0][1])
+        return bool((moved <= 2.0 * sigma_mg + 3.0)[:2].all())
+
+    def _judge(self, s: Sample, c: Circumstances, sigma_mg: Vec3, offsets_sd: float) -> None:
+        if self.held and self._judged_ns is not None:
+            return
+        fresh = self._judged_ns is not None and 0 <= s.boot_ns - self._judged_ns < _VERDICT_EVERY_S * 1e9
+        if fresh:
+            return
+        self._judged_ns = s.boot_ns
+        e = self._estimate
+        steady = self.verdict.state is State.READY and not s.learn
+        evidence = gate.Evidence(
+            estimate=e,
+            expected=c.expected,
+            sigma_mg=sigma_mg,
+            offsets_heading_sigma_rad=offsets_sd,
+            field_mg=self._field_mg,
+            steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
+            sectors=self._excitation.sectors,
+            frozen_s=c.frozen_s,
+            has_attitude=s.tilt_from == "ATTITUDE",
+            relative=c.relative,
+            assumed=c.assumed,
+            parameters_changed=c.parameters_changed,
+            grounded=c.grounded,
+        )
+        self.verdict = gate.judge(evidence, self._limits, self.verdict.state)

@@ -1,0 +1,191 @@
+"""A linear Kalman filter that uses attitude: the levelled field turns with the vehicle and is otherwise constant.
+
+State (9,), mG: b hard iron in the sensor's axes; h the Earth's field in levelled axes, (H cos psi, -H sin psi, V);
+d a short-lived disturbance in levelled axes (tilt error, motors), first-order Gauss-Markov.
+
+Process: when the gyro says the heading grew by a, h <- Rz(a) h; the gyro's own error is noise along the horizontal
+circle. b walks slowly. Measurement, with A and e the autopilot's own matrix and motor term:
+    A m + e = A b + R_bl (h + d) + n                                   linear in the state, so no start value is needed.
+The autopilot's yaw is never a measurement: it follows the compass being judged (estimation.md section 7.1).
+
+All noise is known only up to one common factor, which does not change the gains but scales the covariance; it is
+estimated from the innovations as in geodesy (variance of unit weight). The world model is not mixed into the state:
+it is fused at the moment of asking, so that what motion alone has shown stays visible (own_sigma_mg).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import predict, update
+from numpy.typing import NDArray
+
+from magmav.core.field import ExpectedField
+from magmav.core.rotation import level_from_body
+from magmav.core.types import Estimate, Mat3, Sample, vec3
+
+Array = NDArray[np.float64]
+_B, _H, _D = slice(0, 3), slice(3, 6), slice(6, 9)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What is assumed of sensor, motion and surroundings. Units as named."""
+
+    prior_iron_mg: float = 500.0
+    prior_field_mg: float = 600.0
+    reading_mg: float = 5.0  # sensor noise and rounding
+    sync_s: float = 0.02  # mismatch in time between field and attitude: turns rate into error
+    disturbance_mg: float = 8.0  # of the levelled field: a degree of tilt in 500 mG
+    disturbance_tau_s: float = 10.0
+    iron_walk_mg: float = 0.1  # per square root of a second
+    gyro_walk_rad: float = math.radians(0.15)  # per square root of a second
+    own_gyro_walk_rad: float = math.radians(0.6)  # the same for a gyro nobody has corrected
+    gyro_scale: float = 0.01
+    outlier_nis: float = 16.0  # beyond this (3 degrees of freedom) a reading is trusted less, not thrown away
+    model_mg: float = 8.0  # world model against the real local field
+    factor_lo: float = 0.25  # bounds of the common factor on all sigmas, squared
+    factor_hi: float = 25.0
+    change_nis: float = 8.0  # per axis, kept up for change_s: the iron itself has changed
+    change_s: float = 1.5
+    change_hold_s: float = 3.0
+
+
+class KalmanEstimator:
+    """One compass's filter. ``noise`` holds every number that was chosen."""
+
+    def __init__(self, noise: Noise | None = None) -> None:
+        self.noise = noise or Noise()
+        n = self.noise
+        self._x: Array = np.zeros(9)
+        self._P: Array = np.diag(
+            [n.prior_iron_mg**2] * 3 + [n.prior_field_mg**2] * 3 + [n.disturbance_mg**2] * 3
+        ).astype(np.float64)
+        self._samples = 0
+        self._nis_sum = 0.0  # clipped NIS per axis, and how many
+        self._recent_nis = 1.0
+        self._residual_mg2 = 0.0
+        self._bad_s = 0.0
+        self._since_change_s = 1e9
+        self._innovation_mg = np.zeros(3)
+
+    def step(self, sample: Sample) -> None:
+        """Carry the state to this sample's time and, where the time teaches, learn from it."""
+        self._turn(sample)
+        if sample.learn:
+            self._learn(sample)
+
+    # ------------------------------------------------------------ process
+
+    def _turn(self, s: Sample) -> None:
+        n = self.noise
+        dt = max(s.dt_s, 0.0)
+        fade = math.exp(-dt / n.disturbance_tau_s)
+        F = np.diag([1.0] * 6 + [fade] * 3)
+        c, si = math.cos(s.yaw_step_rad), math.sin(s.yaw_step_rad)
+        F[3:5, 3:5] = ((c, si), (-si, c))
+        Q = np.zeros((9, 9))
+        Q[_B, _B] = np.eye(3) * (n.iron_walk_mg**2 * dt)
+        Q[_D, _D] = np.eye(3) * (n.disturbance_mg**2 * (1.0 - fade * fade))
+        if s.gap:
+            # Nobody knows how far the vehicle turned: the horizontal field may point anywhere.
+            self._forget_direction(F)
+        else:
+            walk = n.gyro_walk_rad if s.tilt_from == "ATTITUDE" else n.own_gyro_walk_rad
+            turn2 = walk**2 * dt + (n.gyro_scale * s.yaw_step_rad) ** 2
+            ahead, right = F[3:5, 3:5] @ self._x[3:5]
+            along = np.array((right, -ahead))
+            Q[3:5, 3:5] = turn2 * (np.outer(along, along) + self._P[3:5, 3:5].trace() / 2.0 * np.eye(2))
+        self._x, self._P = predict(self._x, self._P, F, Q)
+        self._since_change_s += dt
+
+    def _forget_direction(self, F: Array) -> None:
+        prior = self.noise.prior_field_mg**2
+        self._x[3:5] = 0.0
+        F[3:5, :] = 0.0
+        self._P[3:5, :] = 0.0
+        self._P[:, 3:5] = 0.0
+        F[3, 3] = F[4, 4] = 1.0
+        self._P[3, 3] = self._P[4, 4] = prior
+
+    # ------------------------------------------------------------ measurement
+
+    def _learn(self, s: Sample) -> None:
+        n = self.noise
+        body_from_level = level_from_body(s.roll_rad, s.pitch_rad).T
+        H = np.hstack((s.shaping.matrix, body_from_level, body_from_level))
+        z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        total = max(float(np.linalg.norm(self._x[_H])), 200.0)
+        smear = n.sync_s * float(np.linalg.norm(s.rate_b_rads)) * min(total, 700.0)
+        R = np.eye(3) * (n.reading_mg**2 + smear * smear)
+        innovation = z - H @ self._x
+        S = H @ self._P @ H.T + R
+        nis = float(innovation @ np.linalg.solve(S, innovation))
+        self._judge(nis / 3.0, innovation, s.dt_s)
+        limit = n.outlier_nis * self._factor()
+        if nis > limit:
+            R = R + S * (nis / limit - 1.0)
+        self._x, self._P = update(self._x, self._P, z, R, H)
+        self._samples += 1
+        left = z - H @ self._x + body_from_level @ self._x[_D]
+        self._residual_mg2 += (float(left @ left) / 3.0 - self._residual_mg2) / min(self._samples, 500)
+
+    def _judge(self, nis: float, innovation: Array, dt_s: float) -> None:
+        """Keep the innovation statistics; accept that the iron has changed when they stay bad."""
+        n = self.noise
+        clipped = min(nis, n.outlier_nis)
+        if self._samples >= 10:
+            self._nis_sum += clipped
+        weight = min(dt_s / 2.0, 0.2)
+        self._recent_nis += weight * (clipped - self._recent_nis)
+        self._innovation_mg += weight * (innovation - self._innovation_mg)
+        bad = nis > n.change_nis * self._factor() and self._samples > 30
+        self._bad_s = max(0.0, self._bad_s + (dt_s if bad else -dt_s))
+        if self._bad_s >= n.change_s and self._since_change_s >= n.change_hold_s:
+            jump = max(80.0, 1.5 * float(np.linalg.norm(self._innovation_mg)))
+            self._P[_B, _B] += np.eye(3) * jump**2
+            self._bad_s = self._since_change_s = 0.0
+
+    def _factor(self) -> float:
+        """Variance of unit weight, pulled to 1 while few samples speak."""
+        n = self.noise
+        return min(max((self._nis_sum + 50.0) / (max(self._samples - 10, 0) + 50.0), n.factor_lo), n.factor_hi)
+
+    # ------------------------------------------------------------ answer
+
+    def estimate(self, expected: ExpectedField | None) -> Estimate | None:
+        """Belief now, with the world model's field fused in where a position gives it."""
+        if self._samples < 10:
+            return None
+        factor = self._factor()
+        own = np.sqrt(np.diag(self._P)[_B] * factor)
+        x, P = self._x, self._P * factor
+        if expected is not None:
+            x, P = self._with_model(x, P, expected)
+        covariance: Mat3 = P[_B, _B].copy()
+        return Estimate(
+            hard_iron_b_mg=vec3(x[_B], "hard iron"),
+            covariance_mg2=covariance,
+            own_sigma_mg=vec3(own, "sigma"),
+            horizontal_mg=math.hypot(x[3], x[4]),
+            down_mg=float(x[5]),
+            residual_mg=math.sqrt(self._residual_mg2),
+            step_nis=self._recent_nis,
+            samples=self._samples,
+            changed_ago_s=self._since_change_s,
+        )
+
+    def _with_model(self, x: Array, P: Array, expected: ExpectedField) -> tuple[Array, Array]:
+        """Two scalar measurements: the downward field and, once its direction is known, the horizontal strength."""
+        R = np.array([[self.noise.model_mg**2]])
+        down = np.zeros((1, 9))
+        down[0, 5] = 1.0
+        x, P = update(x, P, np.array([expected.down_mg]), R, down)
+        strength = math.hypot(x[3], x[4])
+        if strength > 0.0 and math.sqrt(P[3, 3] + P[4, 4]) < strength / 3.0:
+            along = np.zeros((1, 9))
+            along[0, 3:5] = x[3:5] / strength
+            x, P = update(x, P, np.array([expected.horizontal_mg]), R, along)
+        return x, P

@@ -1,0 +1,47 @@
+"""How much of what could be seen has been seen: directions of the field in body axes, and headings.
+
+Binned in BODY axes (users.md AT-3b): in earth axes every sample of a good flight falls on one spot and shows nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from magmav.core.types import Vec3
+
+_BANDS = (1, 6, 10, 6, 1)  # cells per band from nose-up pole to tail pole: about equal areas
+SECTORS = 12
+CELLS = sum(_BANDS)
+_EDGES = (-0.95, -0.45, 0.45, 0.95)
+
+
+class Excitation:
+    """Cells of the field's direction in body axes, and 30-degree sectors of heading, that have been visited."""
+
+    def __init__(self) -> None:
+        self._cells: set[tuple[int, int]] = set()
+        self._sectors: set[int] = set()
+
+    def see(self, field_b_mg: Vec3, heading_rad: float | None) -> None:
+        """Take a corrected field and its heading."""
+        length = float(np.linalg.norm(field_b_mg))
+        if length <= 0.0:
+            return
+        x, y, z = field_b_mg / length
+        band = sum(z > edge for edge in _EDGES)
+        around = int((math.atan2(y, x) / math.tau % 1.0) * _BANDS[band])
+        self._cells.add((band, min(around, _BANDS[band] - 1)))
+        if heading_rad is not None:
+            self._sectors.add(min(int(heading_rad / math.tau * SECTORS), SECTORS - 1))
+
+    @property
+    def coverage(self) -> float:
+        """Share of the sphere of directions seen, 0 to 1. A full level turn fills a ring, not the sphere."""
+        return len(self._cells) / CELLS
+
+    @property
+    def sectors(self) -> int:
+        """Number of 30-degree heading sectors seen, 0 to 12."""
+        return len(self._sectors)

@@ -1,0 +1,151 @@
+"""May this estimate be written to a vehicle? The one place that decides, and it always says why.
+
+An axis counts as OBSERVED when motion alone has brought its sigma under the line, FROM_MODEL when it needed the field
+model for that, else NOT_OBSERVED. READY wants the forward and right axes known, a field like the Earth's, a fit
+without structure, an estimate that stands still, and stored values that are known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from magmav.core.field import ExpectedField
+from magmav.core.types import AxisState, Estimate, Reason, State, Verdict, Vec3
+
+_WEAK_HORIZONTAL_MG = 100.0
+_EARTH_MG = (150.0, 950.0)
+_FROZEN_S = 3.0
+_SLACK = 1.25  # a verdict once reached is kept until a line is crossed by this much: no flicker
+_HEADING_SECTORS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Lines an estimate must keep; values come from the settings table."""
+
+    axis_sigma_mg: float
+    heading_sigma_rad: float
+    residual_mg: float
+    field_share: float
+    change_s: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Everything a verdict rests on, for one compass at one moment."""
+
+    estimate: Estimate | None
+    expected: ExpectedField | None
+    sigma_mg: Vec3
+    offsets_heading_sigma_rad: float
+    field_mg: float  # mean strength after correction
+    steady: bool
+    sectors: int
+    frozen_s: float
+    has_attitude: bool
+    relative: bool
+    assumed: bool
+    parameters_changed: bool
+    grounded: bool  # a flying vehicle that has not flown yet
+
+
+_Z_NOTE: dict[AxisState, tuple[Reason, ...]] = {
+    AxisState.OBSERVED: (),
+    AxisState.FROM_MODEL: (Reason.Z_FROM_MODEL,),
+    AxisState.NOT_OBSERVED: (Reason.Z_NOT_OBSERVED,),
+}
+NOTHING = Verdict(State.NO_DATA, (AxisState.NOT_OBSERVED,) * 3, (Reason.NO_COMPASS,))
+
+
+def axis_states(own_sigma_mg: Vec3, sigma_mg: Vec3, limit_mg: float) -> tuple[AxisState, AxisState, AxisState]:
+    """State of each axis from its sigma by motion alone and with the model."""
+
+    def one(own: float, all_in: float) -> AxisState:
+        if own <= limit_mg:
+            return AxisState.OBSERVED
+        return AxisState.FROM_MODEL if all_in <= limit_mg else AxisState.NOT_OBSERVED
+
+    x, y, z = (one(float(o), float(s)) for o, s in zip(own_sigma_mg, sigma_mg, strict=True))
+    return x, y, z
+
+
+def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
+    """The verdict. ``was`` is the state before: READY is left a little later than it was entered."""
+    if e.estimate is None:
+        reason = Reason.NOT_FLYING if e.grounded else Reason.TOO_LITTLE_DATA
+        relative = (Reason.RELATIVE_ONLY,) if e.relative else ()
+        return Verdict(State.LEARNING, NOTHING.axes, (reason, *relative, *_notes(e)))
+    slack = _SLACK if was is State.READY else 1.0
+    axes = axis_states(e.estimate.own_sigma_mg, e.sigma_mg, limits.axis_sigma_mg)
+    notes = _Z_NOTE[axes[2]] + _notes(e)
+    wrong = _wrong(e, e.estimate, limits, slack)
+    missing = _missing(e, e.estimate, axes, limits, slack)
+    if wrong:
+        return Verdict(State.REFUSED, axes, wrong + missing + notes)
+    if missing:
+        return Verdict(State.LEARNING, axes, missing + notes)
+    return Verdict(State.READY, axes, notes)
+
+
+def _wrong(e: Evidence, estimate: Estimate, limits: Limits, slack: float) -> tuple[Reason, ...]:
+    """Findings that more data will not heal."""
+    out = []
+    if e.frozen_s > _FROZEN_S:
+        out.append(Reason.FROZEN)
+    if e.expected is None:
+        earthlike = _EARTH_MG[0] <= e.field_mg <= _EARTH_MG[1]
+    else:
+        earthlike = abs(e.field_mg - e.expected.total_mg) <= limits.field_share * slack * e.expected.total_mg
+    if not earthlike and estimate.samples >= limits.samples:
+        out.append(Reason.FIELD_NOT_EARTHLIKE)
+    if estimate.residual_mg > limits.residual_mg * slack and estimate.samples >= limits.samples:
+        out.append(Reason.RESIDUAL_TOO_LARGE)
+    return tuple(out)
+
+
+def _missing(
+    e: Evidence, estimate: Estimate, axes: tuple[AxisState, ...], limits: Limits, slack: float
+) -> tuple[Reason, ...]:
+    """What more flying, or more knowledge of the vehicle, would bring."""
+    out = []
+    if estimate.samples < limits.samples:
+        out.append(Reason.TOO_LITTLE_DATA)
+    names = (Reason.X_NOT_OBSERVED, Reason.Y_NOT_OBSERVED)
+    out += [n for n, axis in zip(names, axes, strict=False) if axis is AxisState.NOT_OBSERVED]
+    if e.offsets_heading_sigma_rad > limits.heading_sigma_rad * slack or e.sectors < _HEADING_SECTORS:
+        out.append(Reason.HEADING_UNSURE)
+    if estimate.changed_ago_s < limits.change_s:
+        out.append(Reason.JUST_CHANGED)
+    if not e.steady:
+        out.append(Reason.STILL_MOVING)
+    if e.relative:
+        out.append(Reason.RELATIVE_ONLY)
+    return tuple(out)
+
+
+def _notes(e: Evidence) -> tuple[Reason, ...]:
+    """What a reader must know even where nothing is refused."""
+    out = []
+    if e.expected is None:
+        out.append(Reason.NO_POSITION)
+    elif e.expected.horizontal_mg < _WEAK_HORIZONTAL_MG:
+        out.append(Reason.HORIZONTAL_WEAK)
+    if not e.has_attitude:
+        out.append(Reason.NO_ATTITUDE)
+    if e.assumed:
+        out.append(Reason.ASSUMED_DEFAULT)
+    if e.parameters_changed:
+        out.append(Reason.PARAMETERS_CHANGED)
+    return tuple(out)
+
+
+def floored(estimate: Estimate, floor_mg: tuple[float, float, float]) -> Vec3:
+    """Claimed sigma per axis, mG: never under what no field test has ever shown (estimation.md, upload rule)."""
+    own = np.sqrt(np.maximum(np.diag(estimate.covariance_mg2), 0.0))
+    out = np.array([math.hypot(float(s), f) for s, f in zip(own, floor_mg, strict=True)])
+    out.flags.writeable = False
+    return out

@@ -1,0 +1,129 @@
+"""Tilt and turning at any moment: from the autopilot's attitude, or, where there is none, from gyro and accelerometer.
+
+Heading is only ever integrated from body rates (over gaps in a slow telemetry stream, from the attitude's own yaw
+steps): the autopilot's yaw follows the compass that is being judged, so its value is never used.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from magmav.core.rotation import euler_rates, tilt_from_force, wrap_pi
+from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Vec3
+
+_FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
+_RATES_HOLD_S = 0.25  # between attitudes further apart, rates say nothing: take the yaw step itself
+_LOST_S = 5.0
+_TILT_TAU_S = 3.0  # accelerometer corrects the gyro's tilt with this time constant
+_G = 9.80665
+
+
+class MotionState(NamedTuple):
+    """Tilt, body rate and integrated heading at one moment."""
+
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float  # integrated, unwrapped, arbitrary zero; comparable only within one epoch
+    rate_b_rads: Vec3
+    source: str
+    epoch: int
+    bridged: bool  # the yaw step over a long gap is still good
+
+
+class Motion:
+    """Keeps the latest tilt of one vehicle."""
+
+    def __init__(self) -> None:
+        self.seen_attitude = False
+        self._att: AttitudeReading | None = None
+        self._yaw_rad = 0.0
+        self._epoch = 0
+        self._own = _OwnTilt()
+
+    def attitude(self, r: AttitudeReading) -> bool:
+        """Take one attitude; False when it is a duplicate or late."""
+        last = self._att
+        if last is not None and r.boot_ns <= last.boot_ns:
+            return False
+        if last is not None:
+            dt = (r.boot_ns - last.boot_ns) / 1e9
+            if dt <= _RATES_HOLD_S:
+                before = euler_rates(last.roll_rad, last.pitch_rad, last.rate_b_rads)[2]
+                after = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)[2]
+                self._yaw_rad += 0.5 * (before + after) * dt
+            elif dt <= _LOST_S:
+                self._yaw_rad += wrap_pi(r.yaw_rad - last.yaw_rad)
+            else:
+                self._epoch += 2
+        self._att, self.seen_attitude = r, True
+        return True
+
+    def inertial(self, r: InertialReading) -> None:
+        """Take accelerometer and gyro."""
+        self._own.step(r)
+
+    def rate_at(self, boot_ns: int) -> float:
+        """Length of the body rate, rad/s, 0 when nothing is known."""
+        state = self.at(boot_ns)
+        return 0.0 if state is None else math.hypot(*state.rate_b_rads)
+
+    def at(self, boot_ns: int) -> MotionState | None:
+        """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
+        a = self._att
+        if a is not None and abs(boot_ns - a.boot_ns) <= _FRESH_NS:
+            age = (boot_ns - a.boot_ns) / 1e9
+            dr, dp, dy = euler_rates(a.roll_rad, a.pitch_rad, a.rate_b_rads)
+            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, self._yaw_rad + dy * age
+            return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True)
+        return self._own.at(boot_ns)
+
+
+class _OwnTilt:
+    """Tilt from a gyro that carries the down direction along, and an accelerometer that slowly corrects it."""
+
+    def __init__(self) -> None:
+        self._down_b = np.zeros(3)
+        self._boot_ns: int | None = None
+        self._source = ""
+        self._rate_b: Vec3 = ZERO3
+        self._yaw_rad = 0.0
+        self._epoch = 1
+
+    def step(self, r: InertialReading) -> None:
+        """Propagate by the gyro, pull towards the accelerometer's down while nothing else accelerates."""
+        if self._source and r.source != self._source:
+            return
+        start = tilt_from_force(r.force_b_mss)
+        if start is None or (self._boot_ns is not None and r.boot_ns <= self._boot_ns):
+            return
+        strength = float(np.linalg.norm(r.force_b_mss))
+        down = -r.force_b_mss / strength
+        dt = 0.0 if self._boot_ns is None else (r.boot_ns - self._boot_ns) / 1e9
+        if self._boot_ns is None or dt > 0.5:
+            self._source, self._down_b = r.source, down
+            self._epoch += 2
+        else:
+            roll, pitch = self._tilt()
+            self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self._rate_b + r.rate_b_rads))[2] * dt
+            turn = 0.5 * (self._rate_b + r.rate_b_rads) * dt
+            moved = self._down_b - np.cross(turn, self._down_b)
+            trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
+            moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
+            self._down_b = moved / np.linalg.norm(moved)
+        self._boot_ns, self._rate_b = r.boot_ns, r.rate_b_rads
+
+    def _tilt(self) -> tuple[float, float]:
+        return tilt_from_force(-self._down_b) or (0.0, 0.0)
+
+    def at(self, boot_ns: int) -> MotionState | None:
+        """Tilt at a boot time within 0.2 s of the last reading."""
+        if self._boot_ns is None or abs(boot_ns - self._boot_ns) > 200_000_000:
+            return None
+        age = (boot_ns - self._boot_ns) / 1e9
+        roll, pitch = self._tilt()
+        dr, dp, dy = euler_rates(roll, pitch, self._rate_b)
+        yaw = self._yaw_rad + dy * age
+        return MotionState(roll + dr * age, pitch + dp * age, yaw, self._rate_b, "OWN", self._epoch, False)

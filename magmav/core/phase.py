@@ -1,0 +1,101 @@
+"""Is the vehicle flying, and since when? What stands on steel and concrete teaches nothing about a compass.
+
+The altitude rule is for vehicles that fly. Rovers, boats, and anything that never says what it is, learn wherever
+they are (users.md N1, N11).
+"""
+
+from __future__ import annotations
+
+import math
+
+from magmav.core.rotation import tilt_angle
+from magmav.core.types import Landed, LandedReading, MotionReading, PositionReading, VehicleReading
+
+# MAV_TYPE of what flies: fixed wing, multirotors, helicopters, airships, flapping wing, VTOLs, parafoil, dodecarotor.
+_FLYERS = frozenset({1, 2, 3, 4, 7, 8, 13, 14, 15, 16, 19, 20, 21, 22, 23, 24, 25, 28, 29, 35, 43})
+_FIXED_WING = 1
+_ALOFT_M = 5.0
+_FAST_MPS = 8.0
+_BLIND_S = 10.0  # armed this long with neither height nor landed state known counts as flying
+_CRASH_TILT_RAD = math.radians(100.0)
+_CRASH_S = 1.0
+
+
+class Phase:
+    """One vehicle's phase of flight. Times are boot times."""
+
+    def __init__(self) -> None:
+        self.kind: int | None = None
+        self.armed = False
+        self.takeoff_ns: int | None = None
+        self.crash_ns: int | None = None
+        self._landed: Landed | None = None
+        self._armed_ns: int | None = None
+        self._alt_m: float | None = None
+        self._alt_armed_m: float | None = None
+        self._height_m: float | None = None
+        self._speed_mps = 0.0
+        self._over_since_ns: int | None = None
+
+    @property
+    def flyer(self) -> bool:
+        """True for a vehicle that is known to fly."""
+        return self.kind in _FLYERS
+
+    def vehicle(self, r: VehicleReading, boot_ns: int) -> None:
+        """Take a heartbeat."""
+        self.kind = r.kind
+        if r.armed and not self.armed:
+            self._armed_ns, self._alt_armed_m = boot_ns, self._alt_m
+        self.armed = r.armed
+
+    def landed(self, r: LandedReading) -> None:
+        """Take a landed state."""
+        self._landed = r.state
+
+    def position(self, r: PositionReading) -> None:
+        """Take a position. Only one message's altitudes are compared with each other."""
+        if r.source != "GLOBAL_POSITION_INT":
+            return
+        self._alt_m = r.alt_m
+        if self.armed and self._alt_armed_m is None:
+            self._alt_armed_m = r.alt_m
+
+    def moving(self, r: MotionReading) -> None:
+        """Take speed and height above home."""
+        self._speed_mps = math.hypot(r.north_mps, r.east_mps)
+        self._height_m = r.height_m
+
+    def aloft(self, boot_ns: int) -> bool:
+        """Armed, in the air and at least 5 m up. Also remembers the first moment it was so."""
+        up = self.armed and self._landed is not Landed.ON_GROUND and self._high(boot_ns)
+        if up and self.takeoff_ns is None:
+            self.takeoff_ns = boot_ns
+        return up
+
+    def _high(self, boot_ns: int) -> bool:
+        heights = [] if self._height_m is None else [self._height_m]
+        if self._alt_m is not None and self._alt_armed_m is not None:
+            heights.append(self._alt_m - self._alt_armed_m)
+        if heights:
+            return max(heights) >= _ALOFT_M or (self.kind == _FIXED_WING and self._speed_mps >= 2 * _FAST_MPS)
+        if self._landed is not None:
+            return self._landed is Landed.IN_AIR
+        return self._armed_ns is not None and boot_ns - self._armed_ns > _BLIND_S * 1e9
+
+    def tilt(self, roll_rad: float, pitch_rad: float, boot_ns: int) -> None:
+        """Watch for a crash: a vehicle that hovers or cruises upright lying on its back for a second."""
+        over = self.armed and self.flyer and self.kind != _FIXED_WING
+        if not over or tilt_angle(roll_rad, pitch_rad) < _CRASH_TILT_RAD:
+            self._over_since_ns = None
+        elif self._over_since_ns is None:
+            self._over_since_ns = boot_ns
+        elif self.crash_ns is None and boot_ns - self._over_since_ns > _CRASH_S * 1e9:
+            self.crash_ns = self._over_since_ns
+
+    def learnable(self, boot_ns: int, on_ground: bool) -> bool:
+        """Does time at this boot time teach? ``on_ground`` is the operator saying that it always does."""
+        aloft = self.aloft(boot_ns)
+        if self.crash_ns is not None:
+            return False
+        return aloft or on_ground or not self.flyer

@@ -1,0 +1,186 @@
+"""MAVLink messages to readings: the one place where wire integers become mG, rad/s, rad and m/s^2 in body axes.
+
+Past this file there is no count, no centidegree, no None and no NaN: what a message does not know gives no reading.
+Only what an autopilot says is read; a gimbal's ATTITUDE or a companion's PARAM_VALUE is not the vehicle's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+
+from magmav.core.rotation import euler_from_quaternion
+from magmav.core.types import (
+    AttitudeReading,
+    CurrentReading,
+    InertialReading,
+    Landed,
+    LandedReading,
+    MagReading,
+    MotionReading,
+    ParamReading,
+    PositionReading,
+    Reading,
+    ThrottleReading,
+    TimeReading,
+    VehicleReading,
+    vec3,
+)
+from magmav.mavlink.codec import Message
+
+_G = 9.80665
+_MS, _US = 1_000_000, 1_000
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+_EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
+_COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
+
+
+class Decoder:
+    """Readings of every vehicle on a link. ``counts`` says what was left out and why."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._autopilot: dict[int, int] = {}  # system -> component of its autopilot
+        self._how: dict[str, Callable[[Message, int], list[Reading]]] = {
+            "RAW_IMU": self._imu,
+            "SCALED_IMU": self._imu,
+            "SCALED_IMU2": self._imu,
+            "SCALED_IMU3": self._imu,
+            "HIGHRES_IMU": self._highres,
+            "ATTITUDE": self._attitude,
+            "ATTITUDE_QUATERNION": self._quaternion,
+            "GLOBAL_POSITION_INT": self._global_position,
+            "GPS_RAW_INT": self._gps,
+            "BATTERY_STATUS": self._battery,
+            "SYS_STATUS": self._battery,
+            "VFR_HUD": self._hud,
+            "SYSTEM_TIME": self._time,
+            "HEARTBEAT": self._heartbeat,
+            "EXTENDED_SYS_STATE": self._landed,
+            "PARAM_VALUE": self._param,
+        }
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Names of the messages that are read."""
+        return frozenset(self._how)
+
+    def readings(self, message: Message) -> list[Reading]:
+        """What this message says, or an empty list, counted, when it says nothing usable."""
+        kind = message.get_type()
+        how = self._how.get(kind)
+        if how is None:
+            return []
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        if kind != "HEARTBEAT" and self._autopilot.get(system, component) != component:
+            self.counts["not from the autopilot"] += 1
+            return []
+        try:
+            return how(message, system)
+        except (ValueError, OverflowError):
+            self.counts[f"{kind}: not a number"] += 1
+            return []
+
+    def _imu(self, m: Message, system: int) -> list[Reading]:
+        kind = m.get_type()
+        if kind == "RAW_IMU":
+            if m.time_usec > _EPOCH_US:
+                self.counts["RAW_IMU: time is not since boot"] += 1
+                return []
+            boot_ns = m.time_usec * _US
+        else:
+            boot_ns = m.time_boot_ms * _MS
+        out: list[Reading] = []
+        if (m.xacc, m.yacc, m.zacc) != (0, 0, 0):
+            force = vec3((m.xacc * _G / 1e3, m.yacc * _G / 1e3, m.zacc * _G / 1e3), "acceleration")
+            rate = vec3((m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3), "rate")
+            out.append(InertialReading(system, kind, boot_ns, force, rate))
+        if (m.xmag, m.ymag, m.zmag) == (0, 0, 0):
+            self.counts[f"{kind}: no compass (all zero)"] += 1
+        else:
+            field = vec3((m.xmag, m.ymag, m.zmag), "field")
+            out.append(MagReading(system, _COMPASS_OF[kind], kind, boot_ns, field))
+        return out
+
+    def _highres(self, m: Message, system: int) -> list[Reading]:
+        if m.time_usec > _EPOCH_US or m.id > 2:
+            self.counts["HIGHRES_IMU: time is not since boot, or instance over 3"] += 1
+            return []
+        boot_ns = m.time_usec * _US
+        out: list[Reading] = []
+        if m.fields_updated & 0b111111 == 0b111111:
+            force, rate = vec3((m.xacc, m.yacc, m.zacc), "acceleration"), vec3((m.xgyro, m.ygyro, m.zgyro), "rate")
+            out.append(InertialReading(system, "HIGHRES_IMU", boot_ns, force, rate))
+        gauss = vec3((m.xmag, m.ymag, m.zmag), "field")
+        if m.fields_updated & 0b111000000 != 0b111000000 or not gauss.any():
+            return out
+        # Some ArduPilot builds send mG times 1000 and call it gauss: a million times too much (autopilots.md 1.2).
+        scale = 1e3 if math.hypot(*gauss) <= 10.0 else 1e-3
+        out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, vec3(gauss * scale, "field")))
+        return out
+
+    def _attitude(self, m: Message, system: int) -> list[Reading]:
+        rate = vec3((m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        angles = vec3((m.roll, m.pitch, m.yaw), "attitude")
+        roll, pitch, yaw = (float(a) for a in angles)
+        return [AttitudeReading(system, "ATTITUDE", m.time_boot_ms * _MS, roll, pitch, yaw, rate)]
+
+    def _quaternion(self, m: Message, system: int) -> list[Reading]:
+        rate = vec3((m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        angles = euler_from_quaternion(m.q1, m.q2, m.q3, m.q4)
+        if angles is None:
+            self.counts["ATTITUDE_QUATERNION: not a rotation"] += 1
+            return []
+        return [AttitudeReading(system, "ATTITUDE_QUATERNION", m.time_boot_ms * _MS, *angles, rate)]
+
+    def _place(self, m: Message, system: int, boot_ns: int) -> list[Reading]:
+        lat, lon = m.lat / 1e7, m.lon / 1e7
+        if (m.lat, m.lon) == (0, 0) or not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
+            self.counts[f"{m.get_type()}: no position"] += 1
+            return []
+        return [PositionReading(system, m.get_type(), boot_ns, lat, lon, m.alt / 1e3)]
+
+    def _global_position(self, m: Message, system: int) -> list[Reading]:
+        boot_ns = m.time_boot_ms * _MS
+        motion = MotionReading(system, boot_ns, m.vx / 100.0, m.vy / 100.0, m.relative_alt / 1e3)
+        return [*self._place(m, system, boot_ns), motion]
+
+    def _gps(self, m: Message, system: int) -> list[Reading]:
+        return self._place(m, system, m.time_usec * _US) if m.fix_type >= 3 else []
+
+    def _battery(self, m: Message, system: int) -> list[Reading]:
+        # BATTERY_STATUS 0 and SYS_STATUS speak of the same, first battery, in units of 10 mA.
+        if m.current_battery < 0 or (m.get_type() == "BATTERY_STATUS" and m.id != 0):
+            return []
+        return [CurrentReading(system, m.get_type(), m.current_battery / 100.0)]
+
+    def _hud(self, m: Message, system: int) -> list[Reading]:
+        return [ThrottleReading(system, m.throttle / 100.0)] if m.throttle <= 100 else []
+
+    def _time(self, m: Message, system: int) -> list[Reading]:
+        # Before 2010 no field model and no GPS week is meant: the vehicle does not know the date yet.
+        if m.time_unix_usec < 1_262_304_000_000_000 or m.time_unix_usec > 4_000_000_000_000_000:
+            return []
+        return [TimeReading(system, m.time_boot_ms * _MS, m.time_unix_usec * _US)]
+
+    def _heartbeat(self, m: Message, system: int) -> list[Reading]:
+        component = m.get_srcComponent()
+        if m.autopilot == _NO_AUTOPILOT or system == 0:
+            return []
+        if self._autopilot.setdefault(system, component) != component:
+            self.counts["second autopilot component"] += 1
+            return []
+        armed = bool(m.base_mode & 128)
+        return [VehicleReading(system, component, m.autopilot, m.type, armed, m.system_status)]
+
+    def _landed(self, m: Message, system: int) -> list[Reading]:
+        if m.landed_state not in Landed._value2member_map_:
+            return []
+        return [LandedReading(system, Landed(m.landed_state))]
+
+    def _param(self, m: Message, system: int) -> list[Reading]:
+        if m.param_id == "_HASH_CHECK" or not math.isfinite(m.param_value):
+            return []
+        component = m.get_srcComponent()
+        return [ParamReading(system, component, m.param_id, m.param_value, m.param_index, m.param_count)]
