@@ -16,7 +16,7 @@ $(VENV)/.ready: pyproject.toml uv.lock
 	  { rm -rf $(VENV); echo "python3-venv is missing: installing it" >&2; \
 	    apt-get update -qq && apt-get install -y -qq python3-venv && $(PYTHON) -m venv $(VENV); }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-	@$(BIN)/uv sync --quiet --frozen --inexact
+	@$(BIN)/uv sync --quiet --frozen --inexact --compile-bytecode
 	@touch $@
 
 demo: $(VENV)/.ready

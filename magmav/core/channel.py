@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from magmav.core.types import ZERO3, Estimate, Heading, Sample, State, Vec3, Ver
 _SIGMA_FLOOR_MG = (1.5, 1.5, 5.0)
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
-_FIELD_TAU_S = 5.0
-_VERDICT_EVERY_S = 0.2
+_GUESS_RAD = math.radians(45.0)  # a heading less sure than this is not published
+_BELIEF_EVERY_NS = 200_000_000
+_FIELD_WEIGHT = 0.04  # five times a second: a memory of five seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,6 @@ class Finding:
     """What is known of one compass after one sample. offsets_mg are to be added by the autopilot (-hard iron)."""
 
     estimate: Estimate
-    hard_iron_b_mg: Vec3
     offsets_mg: Vec3
     sigma_mg: Vec3
     corrected_b_mg: Vec3
@@ -48,6 +48,17 @@ class Finding:
     stored_heading: Heading
     verdict: Verdict
     coverage: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Belief:
+    """What the estimator said when it was last asked."""
+
+    boot_ns: int
+    estimate: Estimate
+    offsets_mg: Vec3
+    sigma_mg: Vec3
+    heading_sigma_rad: float
 
 
 _NO_ESTIMATE = Estimate(ZERO3, np.diag([1e6] * 3), vec3([1e3] * 3, "sigma"), 0.0, 0.0, 0.0, 1.0, 0, 1e9)
@@ -71,7 +82,7 @@ class Channel:
         self._estimate: Estimate | None = None
         self._past: deque[tuple[int, Vec3]] = deque()
         self._field_mg = 0.0
-        self._judged_ns: int | None = None
+        self._belief: _Belief | None = None
         self._resume = False
 
     def step(self, s: Sample, sent_b_mg: Vec3, c: Circumstances) -> Finding:
@@ -80,44 +91,51 @@ class Channel:
             self._resume = True
         else:
             self._estimator.step(self._after_hold(s))
-            if s.learn or self._estimate is None:
-                self._estimate = self._estimator.estimate(c.expected)
-        e = self._estimate or _NO_ESTIMATE
-        corrected = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
-        own_heading = magnetic_heading(corrected, s.roll_rad, s.pitch_rad)
-        if s.learn and self._estimate is not None:
-            self._excitation.see(corrected, own_heading)
-            self._follow(s, e, float(np.linalg.norm(corrected)))
-        sigma = gate.floored(e, _SIGMA_FLOOR_MG)
-        down, horizontal = self._field(e, c.expected)
-        covariance = s.shaping.matrix @ e.covariance_mg2 @ s.shaping.matrix.T
-        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
-        heading_sd = heading_sigma(covariance, horizontal, down, s.roll_rad, s.pitch_rad, tilt_sigma)
-        offsets_sd = heading_sigma(covariance, horizontal, down, 0.0, 0.0, 0.0)
-        self._judge(s, c, sigma, offsets_sd)
+        belief = self._belief
+        if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
+            belief = self._believe(s, c)
+        corrected = s.shaping.matrix @ (s.mag_b_mg - belief.estimate.hard_iron_b_mg) + s.shaping.motor_b_mg
         declination = None if c.expected is None else c.expected.declination_rad
+        known = self._estimate is not None and belief.heading_sigma_rad < _GUESS_RAD
         return Finding(
-            estimate=e,
-            hard_iron_b_mg=e.hard_iron_b_mg,
-            offsets_mg=vec3(-e.hard_iron_b_mg, "offsets"),
-            sigma_mg=sigma,
+            estimate=belief.estimate,
+            offsets_mg=belief.offsets_mg,
+            sigma_mg=belief.sigma_mg,
             corrected_b_mg=corrected,
-            heading=self._heading(s, corrected, heading_sd, declination),
+            heading=heading(corrected, s.roll_rad, s.pitch_rad, belief.heading_sigma_rad, declination)
+            if known
+            else UNKNOWN,
             stored_heading=heading(sent_b_mg, s.roll_rad, s.pitch_rad, math.pi, declination),
             verdict=self.verdict,
             coverage=self._excitation.coverage,
         )
 
+    def _believe(self, s: Sample, c: Circumstances) -> _Belief:
+        """Ask the estimator and judge its answer; a few times a second is often enough."""
+        if not self.held and (s.learn or self._estimate is None):
+            self._estimate = self._estimator.estimate(c.expected)
+        e = self._estimate or _NO_ESTIMATE
+        if s.learn and self._estimate is not None:
+            self._follow(s, e)
+        sigma = gate.floored(e, _SIGMA_FLOOR_MG)
+        down, horizontal = self._field(e, c.expected)
+        covariance = s.shaping.matrix @ e.covariance_mg2 @ s.shaping.matrix.T
+        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
+        self._belief = _Belief(
+            s.boot_ns,
+            e,
+            vec3(-e.hard_iron_b_mg, "offsets"),
+            sigma,
+            heading_sigma(covariance, horizontal, down, s.roll_rad, s.pitch_rad, tilt_sigma),
+        )
+        self._judge(s, c, sigma, heading_sigma(covariance, horizontal, down, 0.0, 0.0, 0.0))
+        return self._belief
+
     def _after_hold(self, s: Sample) -> Sample:
         if not self._resume:
             return s
         self._resume = False
-        return Sample(**{n: getattr(s, n) for n in s.__slots__ if n != "gap"}, gap=True)
-
-    def _heading(self, s: Sample, corrected: Vec3, sigma_rad: float, declination: float | None) -> Heading:
-        """Published only once the two level axes are known at all: a guess is no heading."""
-        known = self._estimate is not None and sigma_rad < math.radians(45.0)
-        return heading(corrected, s.roll_rad, s.pitch_rad, sigma_rad, declination) if known else UNKNOWN
+        return replace(s, gap=True, yaw_step_rad=0.0)
 
     @staticmethod
     def _field(e: Estimate, expected: ExpectedField | None) -> tuple[float, float]:
@@ -125,9 +143,12 @@ class Channel:
             return expected.down_mg, expected.horizontal_mg
         return e.down_mg, e.horizontal_mg
 
-    def _follow(self, s: Sample, e: Estimate, field_mg: float) -> None:
-        """Remember where the estimate was, to tell whether it stands still, and how strong the field is."""
-        weight = min(1.0, s.dt_s / _FIELD_TAU_S) if self._field_mg else 1.0
+    def _follow(self, s: Sample, e: Estimate) -> None:
+        """Remember what has been seen, how strong the field is, and where the estimate was."""
+        corrected = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
+        self._excitation.see(corrected, magnetic_heading(corrected, s.roll_rad, s.pitch_rad))
+        field_mg = float(np.linalg.norm(corrected))
+        weight = _FIELD_WEIGHT if self._field_mg else 1.0
         self._field_mg += weight * (field_mg - self._field_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
             self._past.append((s.boot_ns, e.hard_iron_b_mg))
@@ -141,12 +162,8 @@ class Channel:
         return bool((moved <= 2.0 * sigma_mg + 3.0)[:2].all())
 
     def _judge(self, s: Sample, c: Circumstances, sigma_mg: Vec3, offsets_sd: float) -> None:
-        if self.held and self._judged_ns is not None:
+        if self.held and self.verdict is not gate.NOTHING:
             return
-        fresh = self._judged_ns is not None and 0 <= s.boot_ns - self._judged_ns < _VERDICT_EVERY_S * 1e9
-        if fresh:
-            return
-        self._judged_ns = s.boot_ns
         e = self._estimate
         steady = self.verdict.state is State.READY and not s.learn
         evidence = gate.Evidence(

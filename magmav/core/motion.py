@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magmav.core.rotation import euler_rates, tilt_from_force, wrap_pi
+from magmav.core.rotation import euler_rates, level_from_body, tilt_from_force, wrap_pi
 from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Vec3
 
 _FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
@@ -62,8 +62,12 @@ class Motion:
         return True
 
     def inertial(self, r: InertialReading) -> None:
-        """Take accelerometer and gyro."""
-        self._own.step(r)
+        """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
+        a = self._att
+        if a is not None and r.boot_ns - a.boot_ns <= _FRESH_NS:
+            self._own.seed(a)
+        else:
+            self._own.step(r)
 
     def rate_at(self, boot_ns: int) -> float:
         """Length of the body rate, rad/s, 0 when nothing is known."""
@@ -92,6 +96,12 @@ class _OwnTilt:
         self._yaw_rad = 0.0
         self._epoch = 1
 
+    def seed(self, a: AttitudeReading) -> None:
+        """Start from the autopilot's tilt, should its attitudes end here."""
+        if a.boot_ns != self._boot_ns:
+            self._down_b = level_from_body(a.roll_rad, a.pitch_rad)[2]
+            self._boot_ns, self._rate_b = a.boot_ns, a.rate_b_rads
+
     def step(self, r: InertialReading) -> None:
         """Propagate by the gyro, pull towards the accelerometer's down while nothing else accelerates."""
         if self._source and r.source != self._source:
@@ -102,14 +112,15 @@ class _OwnTilt:
         strength = float(np.linalg.norm(r.force_b_mss))
         down = -r.force_b_mss / strength
         dt = 0.0 if self._boot_ns is None else (r.boot_ns - self._boot_ns) / 1e9
-        if self._boot_ns is None or dt > 0.5:
-            self._source, self._down_b = r.source, down
+        self._source = r.source
+        if self._boot_ns is None or dt > 1.0:
+            self._down_b = down
             self._epoch += 2
         else:
             roll, pitch = self._tilt()
             self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self._rate_b + r.rate_b_rads))[2] * dt
-            turn = 0.5 * (self._rate_b + r.rate_b_rads) * dt
-            moved = self._down_b - np.cross(turn, self._down_b)
+            x, y, z = 0.5 * (self._rate_b + r.rate_b_rads) * dt
+            moved = self._down_b - np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._down_b
             trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
             moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
             self._down_b = moved / np.linalg.norm(moved)

@@ -28,6 +28,8 @@ from magmav.core.types import Estimate, Mat3, Sample, vec3
 
 Array = NDArray[np.float64]
 _B, _H, _D = slice(0, 3), slice(3, 6), slice(6, 9)
+_B_DIAGONAL, _D_DIAGONAL = [0, 10, 20], [60, 70, 80]
+_EYE3, _EYE9 = np.eye(3), np.eye(9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +85,13 @@ class KalmanEstimator:
         n = self.noise
         dt = max(s.dt_s, 0.0)
         fade = math.exp(-dt / n.disturbance_tau_s)
-        F = np.diag([1.0] * 6 + [fade] * 3)
+        F = _EYE9.copy()
+        F[6, 6] = F[7, 7] = F[8, 8] = fade
         c, si = math.cos(s.yaw_step_rad), math.sin(s.yaw_step_rad)
         F[3:5, 3:5] = ((c, si), (-si, c))
         Q = np.zeros((9, 9))
-        Q[_B, _B] = np.eye(3) * (n.iron_walk_mg**2 * dt)
-        Q[_D, _D] = np.eye(3) * (n.disturbance_mg**2 * (1.0 - fade * fade))
+        Q.flat[_B_DIAGONAL] = n.iron_walk_mg**2 * dt
+        Q.flat[_D_DIAGONAL] = n.disturbance_mg**2 * (1.0 - fade * fade)
         if s.gap:
             # Nobody knows how far the vehicle turned: the horizontal field may point anywhere.
             self._forget_direction(F)
@@ -97,7 +100,8 @@ class KalmanEstimator:
             turn2 = walk**2 * dt + (n.gyro_scale * s.yaw_step_rad) ** 2
             ahead, right = F[3:5, 3:5] @ self._x[3:5]
             along = np.array((right, -ahead))
-            Q[3:5, 3:5] = turn2 * (np.outer(along, along) + self._P[3:5, 3:5].trace() / 2.0 * np.eye(2))
+            unsure = (self._P[3, 3] + self._P[4, 4]) / 2.0
+            Q[3:5, 3:5] = turn2 * (along[:, None] * along + ((unsure, 0.0), (0.0, unsure)))
         self._x, self._P = predict(self._x, self._P, F, Q)
         self._since_change_s += dt
 
@@ -117,9 +121,9 @@ class KalmanEstimator:
         body_from_level = level_from_body(s.roll_rad, s.pitch_rad).T
         H = np.hstack((s.shaping.matrix, body_from_level, body_from_level))
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
-        total = max(float(np.linalg.norm(self._x[_H])), 200.0)
-        smear = n.sync_s * float(np.linalg.norm(s.rate_b_rads)) * min(total, 700.0)
-        R = np.eye(3) * (n.reading_mg**2 + smear * smear)
+        total = min(max(math.hypot(*self._x[_H]), 200.0), 700.0)
+        smear = n.sync_s * math.hypot(*s.rate_b_rads) * total
+        R = _EYE3 * (n.reading_mg**2 + smear * smear)
         innovation = z - H @ self._x
         S = H @ self._P @ H.T + R
         nis = float(innovation @ np.linalg.solve(S, innovation))
