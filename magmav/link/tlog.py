@@ -43,7 +43,7 @@ class TlogLink:
             raise
 
     def packets(self) -> Iterator[Packet]:
-        """Packets until the end of the file or close(). LinkError when the file can no longer be read."""
+        """Packets, once through, until the end of the file or close(). LinkError when it cannot be read."""
         try:
             batch = self._first
             while not self._closed:
@@ -56,7 +56,7 @@ class TlogLink:
                     return
                 batch = self._cutter.cut()
         finally:
-            self._file.close()
+            self.close()
 
     def send(self, data: bytes, route: str = "") -> None:
         """A recording hears nothing: counted, nothing else."""
