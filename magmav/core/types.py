@@ -231,6 +231,7 @@ class Reason(Enum):
     SECOND_ROUTE = (46, "the same autopilot is claimed over a second route")
     LINK_LOST = (47, "link to the vehicle was lost")
     NOT_SUPPORTED = (48, "upload to this autopilot is not supported yet")
+    NOT_RECORDED = (49, "the change could not be put on record first")
 
     def __init__(self, number: int, text: str) -> None:
         self.number = number
