@@ -18,6 +18,7 @@ from magmav.link.records import (
 )
 
 _SECOND_US = 1_000_000
+_MINUTE_US = 60 * _SECOND_US
 _TICKS = 5  # quiet ticks at most in one gap: enough for every timeout to be met, however long the gap
 # Bytes in sight that any decision below needs, except at the end of the file.
 AHEAD = 2 * RUN * LONGEST_RECORD
@@ -99,11 +100,12 @@ class RecordCutter:
         if size == 0:
             self._break(out)
         elif plausible(then_us, now_us):
-            leaps_back = behind_us is not None and then_us > behind_us + _SECOND_US
-            falls = then_us < now_us - _SECOND_US
-            last_and_falls = falls and after == len(data) and self._last
-            spike = last_and_falls or (returns and (falls or leaps_back))
-            self._next(out, end, None if spike else then_us)
+            if then_us < now_us - _SECOND_US:  # set back, if the one behind says so too
+                off_us = _MINUTE_US if behind_us is None else abs(behind_us - then_us)
+                damaged = off_us >= min(_MINUTE_US, abs((behind_us or 0) - now_us))
+            else:  # a silence, unless the one behind comes before
+                damaged = plausible(behind_us or 0, now_us) and (behind_us or 0) < then_us - _SECOND_US
+            self._next(out, end, None if damaged else then_us)
         elif (returns and record_size(*data[after + STAMP : after + HEAD.size])) or (
             after == len(data) and self._last
         ):
