@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav_sim.airframe import FRAME_S, GRAVITY_MSS, Airframe, State
@@ -32,6 +33,7 @@ class Mission:
         self._scenario = scenario
         self._a = autopilot
         wind = scenario.wind
+        self._rng = np.random.default_rng([seed, 5])
         self._wind = Wind(wind.speed_mps, math.radians(wind.from_deg), wind.turbulence_mps, FRAME_S, seed)
         self.state = parked(0.0, 0.0, math.radians(scenario.heading_deg))
         self.busy = self.finished = False
@@ -112,7 +114,9 @@ class Mission:
         meanwhile."""
         a, model = self._a, self._scenario.airframe
         air = Airframe(model, a.home, self.state)
-        pilot = QuadPilot() if a.quad else PlanePilot(model)
+        pilot = (
+            QuadPilot(self._scenario.autopilot.velocity_noise_mps, self._rng) if a.quad else PlanePilot(model)
+        )
         stood, shift = self.state, None if a.quad else (0.0, 0.0, 0.0)
         for leg in flight.pattern:
             a.note("pattern", kind=type(leg).__struct_config__.tag)

@@ -53,6 +53,14 @@ class Survey(Pattern, frozen=True, kw_only=True, tag="survey"):
     heading_deg: Annotated[float, msgspec.Meta(ge=0, lt=360)] = 20.0
 
 
+class Bob(Pattern, frozen=True, kw_only=True, tag="bob"):
+    """Quadrotor: up and down on the spot, so that throttle and current swing."""
+
+    cycles: Count = 4
+    height_m: Annotated[float, msgspec.Meta(gt=0, le=50)] = 6.0
+    period_s: Annotated[float, msgspec.Meta(ge=3, le=60)] = 5.0
+
+
 class Straight(Pattern, frozen=True, kw_only=True, tag="straight"):
     """Plane: wings level on the present course."""
 
@@ -88,6 +96,6 @@ class Land(Pattern, frozen=True, kw_only=True, tag="land"):
     sink_mps: Annotated[float, msgspec.Meta(gt=0, le=5)] = 1.0
 
 
-AnyPattern = Takeoff | Hover | Yaw | FigureEight | Survey | Straight | Loiter | STurns | Climb | Land
-QUAD_ONLY = (Hover, Yaw, FigureEight, Survey)
+AnyPattern = Takeoff | Hover | Yaw | FigureEight | Survey | Bob | Straight | Loiter | STurns | Climb | Land
+QUAD_ONLY = (Hover, Yaw, FigureEight, Survey, Bob)
 PLANE_ONLY = (Straight, Loiter, STurns, Climb)

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from magmav_sim.airframe import FRAME_S, State
-from magmav_sim.patterns import AnyPattern, FigureEight, Hover, Land, Survey, Takeoff, Yaw
+from magmav_sim.patterns import AnyPattern, Bob, FigureEight, Hover, Land, Survey, Takeoff, Yaw
 
 MOST_TURN_RADS = math.radians(40)
 _LEAD_IN_S = 2.0
@@ -51,6 +51,8 @@ def fly_quad(pattern: AnyPattern, state: State, height_m: float) -> Flying:
         yield from _figure_eight(pattern, state, height_m)
     elif isinstance(pattern, Survey):
         yield from _survey(pattern, state, height_m)
+    elif isinstance(pattern, Bob):
+        yield from _bob(pattern, state, height_m)
     elif isinstance(pattern, Land):
         yield from _land(pattern, state)
     else:
@@ -78,6 +80,16 @@ def _land(pattern: Land, state: State) -> Flying:
         sink = min(pattern.sink_mps, max(0.4, 0.25 * state.height_m))
         height -= sink * FRAME_S
         state = yield Demand(north, east, height, 0, 0, -sink, heading)
+
+
+def _bob(pattern: Bob, state: State, height_m: float) -> Flying:
+    north, east, heading = state.north_m, state.east_m, state.heading_rad
+    turn = math.tau / pattern.period_s
+    for i in range(round(pattern.cycles * pattern.period_s / FRAME_S)):
+        phase = turn * i * FRAME_S
+        height = height_m + 0.5 * pattern.height_m * (1 - math.cos(phase))
+        climb = 0.5 * pattern.height_m * turn * math.sin(phase)
+        yield Demand(north, east, height, 0, 0, climb, heading)
 
 
 def _yaw(pattern: Yaw, state: State, height_m: float) -> Flying:

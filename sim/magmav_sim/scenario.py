@@ -81,6 +81,7 @@ class AutopilotSpec(_Table, frozen=True, kw_only=True):
     tilt_sigma_deg: _Share = 0.5
     tilt_tau_s: Annotated[float, msgspec.Meta(gt=0)] = 12.0
     gyro_bias_dps: _Share = 0.05
+    velocity_noise_mps: _Share = 0.15
     boot_s: _Share = 1.5
     rates_hz: dict[str, Annotated[float, msgspec.Meta(gt=0, le=100)]] = {}
     parameters: dict[str, float] = {}
