@@ -125,7 +125,8 @@ def score_headings(
     left_out = _exclusions(times, at, window)
     for name, flags in (leave_out or {}).items():
         left_out[name] = np.broadcast_to(np.asarray(flags, dtype=bool), times.shape)
-    left_out["no heading"] = np.any([~np.isfinite(h) for h in headings.values()], axis=0)
+    unheard = np.any([~np.isfinite(h) for h in headings.values()], axis=0)
+    left_out["no heading"] = unheard | left_out.get("no heading", False)
     keep, excluded = _count(left_out, len(times))
     return {
         name: _score(times[keep], shortest_rad(value[keep] - at.yaw_true_rad[keep]), reference.name, excluded)

@@ -191,7 +191,7 @@ def test_every_sample_is_scored_or_counted_once_under_the_first_exclusion():
     score = score_heading(
         flight.boot_s, heading, reference, Window(12.0, 200.0, crash_s=55.0), {"mine": np.arange(n) == 1101}
     )
-    # 25 Hz from 10 s: 50 before the window, then disarmed until 20 s, armed on the ground until 30 s, then flight.
+    # 25 Hz from 10 s: 50 before the window, disarmed until 20 s, armed on the ground until 30 s, then flight.
     assert score.excluded["outside window"] == 50
     assert score.excluded["disarmed"] == 200
     assert score.excluded["not airborne"] == 250
@@ -218,6 +218,13 @@ def test_headings_that_are_compared_share_their_samples():
     assert both["early"].n == both["late"].n == 4
     assert both["early"].excluded == {"no heading": 6}
     assert both["early"].rms_deg == pytest.approx(math.sqrt((36 + 49 + 64 + 81) / 4))
+    again = score_heading(
+        t, np.zeros(10), yaw_only(t, np.zeros(10)), leave_out={"no heading": np.isnan(late)}
+    )
+    assert (again.n, again.excluded) == (
+        4,
+        {"no heading": 6},
+    )  # the caller's own count under that name holds too
 
 
 def test_a_field_is_scored_with_the_references_own_tilt():
@@ -296,8 +303,8 @@ FLIGHTS = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared
 @pytest.mark.flights
 @pytest.mark.skipif(not (FLIGHTS / "thor75.tlog").exists(), reason="real recordings are not here")
 def test_thor_scores_as_published_before_and_after_the_batch_fit():
-    # data/README.md: airborne about 220 to 588 s, uncalibrated 97 deg RMS, attitude-aided batch fit 3.2 deg with
-    # offsets it gives as "about"; which part of the flight that 3.2 covers it does not say (halves: 4.2 and 2.8).
+    # data/README.md: airborne about 220 to 588 s, uncalibrated 97 deg RMS, attitude-aided batch fit 3.2 deg.
+    # The fit's offsets are given as "about", and not which part of the flight 3.2 covers (halves: 4.2, 2.8).
     boot_s, mag = raw_imu(FLIGHTS / "thor75.tlog")
     reference = Reference.from_csv(FLIGHTS / "thor75_truth.csv")
     fit = Calibration((389.0, -162.0, 395.0))
