@@ -8,9 +8,7 @@ class Backoff:
 
     def __init__(self, first_s: float, longest_s: float) -> None:
         if not 0 < first_s <= longest_s:
-            raise ValueError(
-                f"first_s, longest_s: want 0 < first_s <= longest_s, got {first_s!r}, {longest_s!r}"
-            )
+            raise ValueError(f"first_s, longest_s: want 0 < first <= longest, got {first_s!r}, {longest_s!r}")
         self._first_ns = round(first_s * 1e9)
         self._longest_ns = round(longest_s * 1e9)
         self._wait_ns = self._first_ns

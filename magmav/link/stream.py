@@ -61,8 +61,13 @@ class StreamLink:
         longest_retry_s: float = 10.0,
         most_unsent: int = 4096,
     ) -> None:
-        if not tick_s > 0:
-            raise ValueError(f"tick_s: want a positive time, got {tick_s!r}")
+        try:
+            self._backoff = Backoff(retry_s, longest_retry_s)
+            if not tick_s > 0:
+                raise ValueError(f"tick_s: want a positive time, got {tick_s!r}")
+        except ValueError:
+            port.close()
+            raise
         self.name = name
         self.counts: Counter[str] = Counter(opened=1)
         self.unix_offset_ns = time.time_ns() - clock_ns()
@@ -70,7 +75,6 @@ class StreamLink:
         self._reopen = reopen
         self._tick_ms = tick_s * 1000
         self._clock_ns = clock_ns
-        self._backoff = Backoff(retry_s, longest_retry_s)
         self._most_unsent = most_unsent
         self._unsent = bytearray()
         self._lives = 1

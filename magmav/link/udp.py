@@ -44,6 +44,7 @@ class UdpLink:
         forget_s: float,
     ) -> None:
         if not tick_s > 0:
+            sock.close()
             raise ValueError(f"tick_s: want a positive time, got {tick_s!r}")
         self.name = name
         self.counts: Counter[str] = Counter()
