@@ -21,6 +21,7 @@ UNKNOWN = "not known"
 _STATES = {"NO_DATA": "no data", "LEARNING": "learning", "READY": "ready", "REFUSED": "refused"}
 _COLOURS = {"NO_DATA": "red", "LEARNING": "yellow", "READY": "green", "REFUSED": "red"}
 _AXES = {"OBSERVED": "observed", "FROM_MODEL": "from the field model", "NOT_OBSERVED": "not observed"}
+_AUTOPILOTS = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
 _AXIS_NAMES = ("x forward", "y right", "z down")
 RESULTS = {
     "ALL_NEW": "all new values are in place and proven",
@@ -44,7 +45,8 @@ def replay_view(result: Json) -> RenderableType:
     parts: list[RenderableType] = [_line(_word(result.get("source")), "bold")]
     vehicles = result.get("vehicles") or []
     for vehicle in vehicles:
-        name = f"System {_word(vehicle.get('system'))}, {_word(vehicle.get('autopilot'))}"
+        kind = vehicle.get("autopilot")
+        name = f"System {_word(vehicle.get('system'))}, {_AUTOPILOTS.get(kind, f'autopilot {_word(kind)}')}"
         parts += [Text(), _line(name, "bold")]
         parts += [_compass(compass) for compass in vehicle.get("compasses") or []]
         if not vehicle.get("compasses"):
@@ -65,7 +67,8 @@ def replay_view(result: Json) -> RenderableType:
 def summary_view(results: Iterable[Json]) -> RenderableType:
     """Many recordings, one row per compass."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("recording", "compass", "offsets to store, mG", "one sigma", "verdict"):
+    table.add_column("recording", overflow="fold")
+    for name in ("compass", "offsets to store, mG", "one sigma", "verdict"):
         table.add_column(name)
     table.add_column("heading RMS, deg", justify="right")
     table.add_column("against")
@@ -84,9 +87,7 @@ def summary_view(results: Iterable[Json]) -> RenderableType:
                 _line(_word(heading.get("reference"))),
             )
         if not rows:
-            table.add_row(
-                _line(_word(result.get("source"))), *[_line("no compass was seen")], *[Text("")] * 5
-            )
+            table.add_row(_line(_word(result.get("source"))), *[Text()] * 3, _line("no compass"))
     return table
 
 
@@ -235,5 +236,5 @@ def _word(value: Any) -> str:
 
 
 def _line(text: str, style: str = "") -> Text:
-    """Text as it stands. Names come off the wire and from files: no markup, no escape codes for a terminal."""
+    """Text as it stands. Names come off the wire and from files: no markup and no escape codes."""
     return Text("".join(c if c.isprintable() or c == "\n" else "?" for c in text), style=style)
