@@ -1,0 +1,568 @@
+"""The transaction against a scripted ArduPilot: what must never happen, and that it always ends."""
+
+from __future__ import annotations
+
+import math
+import random
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from scripted_vehicle import MS, S, Vehicle, f32
+
+from magmav.core.types import Change, Reason, UploadResult
+from magmav.mavlink.change import code_needed, confirmation_code, dry_run, restore_blockers
+from magmav.mavlink.presence import Presence
+from magmav.mavlink.terms import UploadSettings
+from magmav.mavlink.upload import Upload
+from magmav.mavlink.watch import Watch
+from magmav.store import Store
+
+NAMES = ("COMPASS_OFS_X", "COMPASS_OFS_Y", "COMPASS_OFS_Z")
+OLD = (f32(5.3), f32(-12.1), f32(40.7))
+
+
+def a_change(*step: float, **other: Any) -> Change:
+    step = step or (60.0, -45.0, 80.0)
+    new = tuple(f32(o + s) for o, s in zip(OLD, step, strict=True))
+    made = Change(
+        1, 1, "COMPASS_DEV_ID", 97539, NAMES, OLD, new, step, (1.0, 1.0, 1.0), tuple(map(abs, step))
+    )
+    return replace(made, **other)
+
+
+class Notes:
+    """A journal in memory that knows what had been sent when it was asked to begin."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.began: list[int] = []
+        self.ended: list[tuple[int, UploadResult, tuple[Reason, ...]]] = []
+        self.fails: OSError | None = None
+
+    def begin(self, change: Change, unix_ns: int, undoes: int | None = None, vehicle: str = "") -> int:
+        if self.fails is not None:
+            raise self.fails
+        assert not self.vehicle.sets, "S2: on record before the first write"
+        self.began.append(unix_ns)
+        return 7
+
+    def finish(self, row: int, result: UploadResult, reasons: Sequence[Reason]) -> None:
+        self.ended.append((row, result, tuple(reasons)))
+
+
+class Rig:
+    """Vehicle, presence, watch and journal, latched and ready."""
+
+    def __init__(self, seed: int = 0, latch_s: float = 4.0, **knobs: Any) -> None:
+        self.vehicle = Vehicle(seed)
+        for name, value in knobs.items():
+            setattr(self.vehicle, name, value)
+        self.presence = Presence()
+        self.watch = Watch(self.presence)
+        self.journal = Notes(self.vehicle)
+        self.vehicle.run(None, latch_s, self.feed)
+        self.upload: Upload | None = None
+
+    def feed(self, message: Any, route: str, now_ns: int) -> None:
+        self.presence.on_message(message, route, now_ns)
+        self.presence.poll(now_ns)
+        self.watch.on_message(message, route, now_ns)
+
+    def go(self, change: Change | None = None, *, until_s: float = 150.0, **more: Any) -> Upload:
+        self.upload = upload = Upload(change or a_change(), self.watch, journal=self.journal, **more)
+        self.vehicle.receive(upload.start(self.vehicle.now_ns))
+        self.vehicle.run(upload, until_s, self.feed)
+        assert upload.result is not None, f"it always ends, but is in {upload.phase}"
+        return upload
+
+    def stored(self) -> tuple[float, ...]:
+        return tuple(self.vehicle.params[name] for name in NAMES)
+
+    def check_S1(self) -> None:
+        """No PARAM_SET without a disarmed heartbeat at most 1.2 s old, nor after one that says armed."""
+        for when, name, _ in self.vehicle.sets:
+            beats = [
+                (t, bool(m.base_mode & 128))
+                for t, m, route in self.vehicle.delivered
+                if m.get_type() == "HEARTBEAT" and t <= when
+            ]
+            last_ns, armed = beats[-1]
+            assert not armed, f"{name} was written after a heartbeat that said armed"
+            assert when - last_ns <= 1200 * MS, (
+                f"{name} was written {(when - last_ns) / S} s after a heartbeat"
+            )
+            assert name in NAMES, f"S5, S9: {name} was written"
+
+
+def test_success_is_written_read_back_and_proven() -> None:
+    rig = Rig()
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.ALL_NEW, ())
+    assert rig.stored() == a_change().new
+    assert [(n, v) for _, n, v in rig.vehicle.sets] == list(zip(NAMES, a_change().new, strict=True))
+    assert rig.vehicle.sets[0][0] == rig.vehicle.sets[2][0], "back to back"
+    assert rig.journal.ended == [(7, UploadResult.ALL_NEW, ())]
+    assert "take-off" in upload.progress  # S20
+    last_set = max(t for t, m in rig.vehicle.sent if m.get_type() == "PARAM_SET")
+    read_back = [
+        m.param_id for t, m in rig.vehicle.sent if m.get_type() == "PARAM_REQUEST_READ" and t > last_set
+    ]
+    assert read_back == list(NAMES), "S11: every name is read back"
+    rig.check_S1()
+
+
+def test_writes_go_out_within_half_a_second_of_the_heartbeat() -> None:
+    for shift_ms in range(0, 1000, 140):
+        rig = Rig(latch_s=4.0 + shift_ms / 1000)
+        assert rig.go().result is UploadResult.ALL_NEW
+        beats = [t for t, m, _ in rig.vehicle.delivered if m.get_type() == "HEARTBEAT"]
+        for when, _, _ in rig.vehicle.sets:
+            assert when - max(t for t in beats if t <= when) <= 500 * MS
+
+
+def test_dry_run_names_exactly_what_is_sent() -> None:
+    rig = Rig()
+    said = [line.split(" (")[0] for line in dry_run(a_change())]
+    rig.go()
+    sent = [
+        f"{m.get_type()} {m.param_id}" + (f" {m.param_value!r}" if m.get_type() == "PARAM_SET" else "")
+        for _, m in rig.vehicle.sent
+    ]
+    assert sent == said
+
+
+def test_S11_echo_without_effect_ends_with_the_old_values() -> None:
+    rig = Rig()
+    rig.vehicle.applies = False
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.ALL_OLD, (Reason.UNPROVEN,))
+    assert rig.stored() == OLD
+    assert [v for _, _, v in rig.vehicle.sets] == [*a_change().new, *OLD]
+    rig.check_S1()
+
+
+def test_S11_an_effect_of_the_wrong_sign_or_axis_is_no_proof() -> None:
+    for shift in ((-60.0, 45.0, -80.0), (45.0, 60.0, 80.0), (60.0, -45.0, 60.0)):
+        upload = Rig().go(a_change(shift_b_mg=shift))
+        assert (upload.result, upload.reasons) == (UploadResult.ALL_OLD, (Reason.UNPROVEN,))
+
+
+def test_S11_how_unsure_the_estimate_is_does_not_soften_the_proof() -> None:
+    rig = Rig()
+    rig.vehicle.applies = False
+    assert rig.go(a_change(shift_sigma_mg=(100.0, 100.0, 100.0))).result is UploadResult.ALL_OLD
+
+
+def test_S11_a_stream_that_stops_after_the_write_proves_nothing() -> None:
+    rig = Rig()
+    rig.vehicle.on_set = lambda name: setattr(rig.vehicle, "streams", False)
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.ALL_OLD, (Reason.NO_STREAM, Reason.UNPROVEN))
+    assert rig.stored() == OLD
+
+
+def refused(rig: Rig, *why: Reason, **more: Any) -> None:
+    upload = rig.go(**more)
+    assert (upload.result, upload.reasons) == (UploadResult.REFUSED, why)
+    assert not rig.vehicle.sets and not rig.journal.began
+    assert rig.stored() == OLD
+
+
+def test_S1_armed_at_the_start_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.armed = True
+    refused(rig, Reason.ARMED)
+
+
+def test_S1_armed_on_any_route_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.at.append(
+        (rig.vehicle.now_ns + S, lambda: rig.vehicle.say(rig.vehicle.heartbeat(True), "udp:2"))
+    )
+    refused(rig, Reason.ARMED, Reason.SECOND_ROUTE)
+
+
+def test_rule_11_a_second_route_claiming_the_autopilot_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.at.append((rig.vehicle.now_ns + S, lambda: rig.vehicle.say(rig.vehicle.heartbeat(), "udp:2")))
+    refused(rig, Reason.SECOND_ROUTE)
+
+
+def test_S1_old_heartbeat_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.heartbeats = False
+    refused(rig, Reason.HEARTBEAT_OLD)
+
+
+def test_S1_in_the_air_or_unknown_and_moving_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.landed_state = 2
+    refused(rig, Reason.NOT_LANDED)
+    refused(Rig(landed_state=None), Reason.NOT_LANDED)  # nobody says landed, and no speed is known
+    refused(Rig(landed_state=0, speed_cms=80), Reason.NOT_LANDED)
+    refused(Rig(landed_state=None, speed_cms=0, gyro_mrads=90), Reason.NOT_LANDED)
+
+
+def test_S1_unknown_landed_state_but_slow_and_still_for_five_seconds_is_enough() -> None:
+    rig = Rig(landed_state=None, speed_cms=10)
+    begin_ns = rig.vehicle.now_ns - 4 * S
+    assert rig.go().result is UploadResult.ALL_NEW
+    assert rig.vehicle.sets[0][0] - begin_ns >= 5 * S
+
+
+def test_S6_another_device_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.params["COMPASS_DEV_ID"] = 131874.0
+    refused(rig, Reason.DEVICE_CHANGED)
+
+
+def test_S7_each_sign_of_a_second_writer_is_refused() -> None:
+    rig = Rig()
+    rig.vehicle.params["COMPASS_LEARN"] = 3.0
+    refused(rig, Reason.SECOND_WRITER)
+    rig = Rig()
+    rig.vehicle.calibrating = True
+    refused(rig, Reason.SECOND_WRITER)
+    rig = Rig()
+    rig.vehicle.params["COMPASS_OFS_Y"] = math.nextafter(OLD[1], 0.0)  # same float32: no change
+    assert rig.go().result is UploadResult.ALL_NEW
+    rig = Rig()
+    rig.vehicle.params["COMPASS_OFS_Y"] = f32(-12.2)
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.REFUSED, (Reason.OFFSETS_CHANGED,))
+    assert not rig.vehicle.sets
+
+
+@given(st.sampled_from([math.nan, math.inf, -math.inf, 1e39, 1801.0, -2500.0]), st.integers(0, 2))
+@settings(max_examples=12, deadline=None)
+def test_S8_what_is_no_number_or_beyond_the_limit_is_refused(value: float, axis: int) -> None:
+    new = list(a_change().new)
+    new[axis] = value
+    change = a_change(new=tuple(new))
+    rig = Rig()
+    upload = rig.go(change, confirm=confirmation_code(change))
+    assert upload.result is UploadResult.REFUSED
+    assert Reason.BEYOND_LIMIT in upload.reasons
+    assert not rig.vehicle.sets
+
+
+def test_S8_the_length_counts_with_the_axis_that_stays() -> None:
+    rig = Rig()
+    rig.vehicle.params["COMPASS_OFS_Z"] = rig.vehicle.applied["COMPASS_OFS_Z"] = 170.0
+    rig.vehicle.params["COMPASS_OFFS_MAX"] = 175.0
+    part = Change(
+        1, 1, "COMPASS_DEV_ID", 97539, NAMES[:1], OLD[:1], (f32(65.3),), (60.0, 0.0, 0.0), (1.0,) * 3, (60.0,)
+    )
+    upload = rig.go(part)  # hypot(65, 12, 170) = 182
+    assert (upload.result, upload.reasons) == (UploadResult.REFUSED, (Reason.BEYOND_LIMIT,))
+    rig.vehicle.params["COMPASS_OFFS_MAX"] = 190.0
+    assert rig.go(part).result is UploadResult.ALL_NEW
+    assert {name for _, name, _ in rig.vehicle.sets} == {"COMPASS_OFS_X"}, "S4: no other axis is touched"
+
+
+def test_S8_a_big_step_wants_its_code() -> None:
+    change = a_change(20.0, -170.0, 10.0)
+    code = code_needed(change)
+    assert code is not None
+    refused(Rig(), Reason.CONFIRM_CHANGE, change=change)
+    refused(Rig(), Reason.CONFIRM_CHANGE, change=change, confirm=code - 1 if code > 1000 else 1001)
+    assert Rig().go(change, confirm=code).result is UploadResult.ALL_NEW
+    assert str(code) in dry_run(change)[-1]
+    understated = replace(change, step_mg=(0.0, 0.0, 0.0))
+    refused(Rig(), Reason.CONFIRM_CHANGE, change=understated)
+    assert code_needed(a_change(150.0 - 1e-3, 0.0, 0.0)) is None
+
+
+def test_confirmation_code_stands_for_one_change_in_every_process() -> None:
+    change = a_change(20.0, -170.0, 10.0)
+    others = [
+        replace(change, system=2),
+        replace(change, device_id=97540),
+        replace(change, new=(change.new[0], change.new[1], math.nextafter(change.new[2], 99.0) + 1e-5)),
+        replace(change, old=(0.0, *change.old[1:])),
+    ]
+    codes = {confirmation_code(c) for c in [change, *others]}
+    assert len(codes) == 5 and all(1000 <= code <= 9999 for code in codes)
+    program = (
+        "from magmav.core.types import Change; from magmav.mavlink.change import confirmation_code;"
+        f"print(confirmation_code({change!r}))"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert int(run.stdout) == confirmation_code(change)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["COMPASS_DIA_X", "COMPASS_ODI2_X", "COMPASS_SCALE", "COMPASS_MOT_X", "COMPASS_ORIENT", "COMPASS_USE",
+     "COMPASS_DEV_ID", "COMPASS_PRIO1_ID", "COMPASS_DEC", "COMPASS_LEARN", "COMPASS_CAL_FIT", "ARMING_CHECK",
+     "COMPASS_OFS4_X", "COMPASS_OFS_X2", "xCOMPASS_OFS_X", "COMPASS_OFS2_X", "COMPASS_OFFS_MAX"],
+)  # fmt: skip
+def test_S5_S9_anything_but_this_compass_offsets_is_a_wrong_call(name: str) -> None:
+    rig = Rig(latch_s=0.1)
+    with pytest.raises(ValueError, match="change"):
+        Upload(a_change(names=(name, *NAMES[1:])), rig.watch, journal=rig.journal)
+
+
+def test_both_naming_schemes_are_known_and_not_mixed() -> None:
+    rig = Rig(latch_s=0.1)
+    for stem, device in (("COMPASS_OFS3_", "COMPASS_DEV_ID3"), ("COMPASS2_OFS_", "COMPASS2_DEV_ID")):
+        names = tuple(stem + axis for axis in "XYZ")
+        Upload(a_change(names=names, device_name=device), rig.watch, journal=rig.journal)
+        with pytest.raises(ValueError, match="one compass"):
+            Upload(a_change(names=names), rig.watch, journal=rig.journal)
+
+
+def test_no_stream_is_refused_before_anything_is_written() -> None:
+    rig = Rig()
+    rig.vehicle.streams = False
+    refused(rig, Reason.NO_STREAM)
+
+
+def test_wrong_vehicle_and_other_autopilots_and_no_change_are_refused_at_once() -> None:
+    refused(Rig(), Reason.WRONG_VEHICLE, change=a_change(system=2))
+    refused(Rig(), Reason.NOTHING_TO_DO, change=a_change(0.0, 0.0, 0.0))
+    rig = Rig()
+    assert rig.presence.autopilot is not None
+    rig.presence.autopilot = replace(rig.presence.autopilot, kind=12)
+    upload = Upload(a_change(), rig.watch, journal=rig.journal)
+    assert upload.start(rig.vehicle.now_ns) == []
+    assert upload.reasons == (Reason.NOT_SUPPORTED,)
+    refused(Rig(latch_s=0.5), Reason.HEARTBEAT_OLD)  # nobody latched yet
+
+
+def test_unknown_name_is_refused_in_ten_seconds_silent_or_not() -> None:
+    rig = Rig()
+    del rig.vehicle.params["COMPASS_LEARN"]
+    begin_ns = rig.vehicle.now_ns
+    refused(rig, Reason.UNKNOWN_PARAM)
+    assert rig.vehicle.now_ns - begin_ns <= 10.1 * S
+    rig = Rig()
+    error = dialect.MAVLink_param_error_message(1, 191, b"COMPASS_LEARN", -1, 1)
+    rig.vehicle.at.append((rig.vehicle.now_ns + S, lambda: rig.vehicle.say(error)))
+    del rig.vehicle.params["COMPASS_LEARN"]
+    begin_ns = rig.vehicle.now_ns
+    refused(rig, Reason.UNKNOWN_PARAM)
+    assert rig.vehicle.now_ns - begin_ns <= 1.1 * S
+
+
+def test_a_deaf_vehicle_is_asked_a_bounded_number_of_times() -> None:
+    rig = Rig()
+    rig.vehicle.deaf = True
+    refused(rig, Reason.UNKNOWN_PARAM)
+    assert len(rig.vehicle.sent) <= 6 * 20
+    rig = Rig()
+    rig.vehicle.on_set = lambda name: setattr(rig.vehicle, "deaf", True)  # deaf after the first write
+    upload = rig.go()
+    assert upload.result is UploadResult.PENDING_RESTORE
+    assert upload.reasons == (Reason.UNKNOWN_PARAM, Reason.UNKNOWN_PARAM)[:1]
+    assert len(rig.vehicle.sets) <= 3 * 6 * 2
+    assert rig.journal.ended[0][1] is UploadResult.PENDING_RESTORE
+    rig.check_S1()
+
+
+def test_S2_no_record_no_write() -> None:
+    rig = Rig()
+    rig.journal.fails = OSError("disk full")
+    refused(rig, Reason.NOT_RECORDED)
+    rig.journal.fails = BlockingIOError("somebody else")
+    refused(rig, Reason.BUSY)
+
+
+def test_S3_armed_between_write_one_and_two_stops_and_says_so() -> None:
+    rig = Rig()
+    vehicle = rig.vehicle
+
+    def arm(name: str) -> None:
+        vehicle.armed, vehicle.deaf = True, True  # the second and third PARAM_SET are lost
+        vehicle.say(vehicle.heartbeat())
+
+    vehicle.on_set = arm
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.ARMED,))
+    assert rig.stored() == (a_change().new[0], *OLD[1:])
+    texts = [m for _, m in vehicle.sent if m.get_type() == "STATUSTEXT"]
+    assert [m.severity for m in texts] == [dialect.MAV_SEVERITY_CRITICAL]
+    assert rig.journal.ended == [(7, UploadResult.PENDING_RESTORE, (Reason.ARMED,))]
+    rig.check_S1()
+
+    # while armed the way back is refused, after disarming it works and restores exactly
+    vehicle.deaf, sets, vehicle.on_set = False, len(vehicle.sets), lambda name: None
+    vehicle.sets.clear()
+    again = rig.go(undoes=7)
+    assert (again.result, again.reasons, vehicle.sets) == (UploadResult.REFUSED, (Reason.ARMED,), [])
+    vehicle.armed = False
+    vehicle.run(None, 2.0, rig.feed)
+    again = rig.go(undoes=7)
+    assert (again.result, again.reasons) == (UploadResult.ALL_OLD, ())
+    assert rig.stored() == OLD
+    assert [name for _, name, _ in vehicle.sets] == ["COMPASS_OFS_X"], "what is old already is left alone"
+    assert sets == 3
+    rig.check_S1()
+
+
+def test_link_loss_midway_is_pending_and_ends_in_seconds() -> None:
+    rig = Rig()
+    rig.vehicle.on_set = lambda name: setattr(rig.vehicle, "loss", 1.0)
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.LINK_LOST,))
+    assert rig.vehicle.now_ns - rig.vehicle.sets[0][0] <= 6 * S
+    rig.check_S1()
+
+
+def test_heartbeats_alone_missing_stop_the_writing_after_their_age() -> None:
+    rig = Rig()
+    vehicle = rig.vehicle
+
+    def mute(name: str) -> None:
+        vehicle.heartbeats, vehicle.deaf = False, True
+
+    vehicle.on_set = mute
+    upload = rig.go()
+    assert upload.result is UploadResult.PENDING_RESTORE
+    assert Reason.LINK_LOST in upload.reasons
+    rig.check_S1()
+
+
+def test_a_reboot_midway_is_pending() -> None:
+    rig = Rig()
+    rig.vehicle.speed_cms = 0
+    rig.vehicle.on_set = lambda name: rig.vehicle.say(dialect.MAVLink_system_time_message(0, 50))
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.LINK_LOST,))
+
+
+def test_restore_after_success_brings_back_the_exact_values_with_proof() -> None:
+    rig = Rig()
+    assert rig.go().result is UploadResult.ALL_NEW
+    rig.vehicle.sets.clear()
+    undo = rig.go(undoes=7)
+    assert (undo.result, undo.reasons) == (UploadResult.ALL_OLD, ())
+    assert rig.stored() == OLD
+    rig.check_S1()
+
+
+def test_restore_obeys_S1_S6_S7() -> None:
+    for spoil, why in (
+        (lambda v: setattr(v, "armed", True), Reason.ARMED),
+        (lambda v: setattr(v, "landed_state", 2), Reason.NOT_LANDED),
+        (lambda v: v.params.update(COMPASS_DEV_ID=1.0), Reason.DEVICE_CHANGED),
+        (lambda v: v.params.update(COMPASS_LEARN=3.0), Reason.SECOND_WRITER),
+        (lambda v: v.params.update(COMPASS_OFS_Z=1.0), Reason.OFFSETS_CHANGED),
+    ):
+        rig = Rig()
+        rig.go()
+        rig.vehicle.sets.clear()
+        spoil(rig.vehicle)
+        undo = rig.go(undoes=7)
+        assert (undo.result, undo.reasons, rig.vehicle.sets) == (UploadResult.REFUSED, (why,), [])
+
+
+def test_restore_needs_no_code_and_no_stream() -> None:
+    rig = Rig()
+    change = a_change(20.0, -170.0, 10.0)
+    rig.go(change, confirm=confirmation_code(change))
+    rig.vehicle.streams, rig.vehicle.landed_state = False, 1
+    rig.vehicle.sets.clear()
+    assert rig.go(change, undoes=7).result is UploadResult.ALL_OLD
+    assert rig.stored() == OLD
+
+
+def test_restore_decision_asks_unless_every_value_is_ours_or_the_old_one() -> None:
+    change = a_change()
+    held = dict(zip(NAMES, change.old, strict=True)) | {"COMPASS_DEV_ID": 97539.0}
+    assert restore_blockers(change, 1, held) == ()
+    assert restore_blockers(change, 1, held | {"COMPASS_OFS_X": change.new[0]}) == ()
+    assert restore_blockers(change, 2, held) == (Reason.WRONG_VEHICLE,)
+    assert restore_blockers(change, 1, held | {"COMPASS_OFS_X": 0.5}) == (Reason.OFFSETS_CHANGED,)
+    assert restore_blockers(change, 1, held | {"COMPASS_DEV_ID": 1.0}) == (Reason.DEVICE_CHANGED,)
+    assert restore_blockers(change, 1, {}) == (Reason.UNKNOWN_PARAM,)
+
+
+def test_AT8a_thirty_percent_loss_both_ways_is_never_mixed() -> None:
+    ends: dict[UploadResult, int] = {}
+    for seed in range(60):
+        rig = Rig(seed)
+        dice = rig.vehicle.random
+        rig.vehicle.loss, rig.vehicle.duplicate = 0.3, 0.1
+        rig.vehicle.delay_ns = lambda dice=dice: round(dice.uniform(5, 300) * MS)  # type: ignore[misc]
+        upload = rig.go()
+        assert upload.result in (UploadResult.ALL_NEW, UploadResult.ALL_OLD), (seed, upload.reasons)
+        assert rig.stored() == (a_change().new if upload.result is UploadResult.ALL_NEW else OLD), seed
+        rig.check_S1()
+        ends[upload.result] = ends.get(upload.result, 0) + 1
+    assert ends[UploadResult.ALL_NEW] >= 57, ends
+
+
+def test_AT8a_late_copies_of_a_write_cannot_undo_the_retreat() -> None:
+    for seed in range(10):
+        rig = Rig(seed)
+        rig.vehicle.applies = False
+        dice = rig.vehicle.random
+        rig.vehicle.loss, rig.vehicle.duplicate = 0.1, 0.5
+        rig.vehicle.delay_ns = lambda dice=dice: round(dice.choice((5, 100, 1900)) * MS)  # type: ignore[misc]
+        upload = rig.go()
+        rig.vehicle.run(None, 4.0, rig.feed)  # let everything arrive
+        assert upload.result is UploadResult.ALL_OLD, (seed, upload.reasons)
+        assert rig.stored() == OLD, seed
+
+
+def test_S1_S3_fuzzed_arming_never_meets_a_write() -> None:
+    results = set()
+    for seed in range(500):
+        dice = random.Random(seed)
+        rig = Rig(seed, latch_s=3.4)
+        vehicle = rig.vehicle
+        vehicle.loss = dice.choice((0.0, 0.0, 0.2))
+        vehicle.applies = dice.random() < 0.7  # retreats are met too
+        at_ns = vehicle.now_ns + round(dice.uniform(0.5, 12.0) * S)
+        spoil = dice.choice(("arm", "arm", "arm and say", "mute", "flap"))
+
+        def act(vehicle: Vehicle = vehicle, spoil: str = spoil) -> None:
+            if spoil == "mute":
+                vehicle.heartbeats = False
+                return
+            vehicle.armed = True
+            if spoil == "arm and say":
+                vehicle.say(vehicle.heartbeat())
+            if spoil == "flap":
+                vehicle.at.append((vehicle.now_ns + 900 * MS, lambda: setattr(vehicle, "armed", False)))
+
+        vehicle.at.append((at_ns, act))
+        upload = rig.go(until_s=60.0)
+        rig.check_S1()
+        if upload.result in (UploadResult.REFUSED, UploadResult.ALL_OLD):
+            assert rig.stored() == OLD, seed
+        elif upload.result is UploadResult.ALL_NEW:
+            assert rig.stored() == a_change().new, seed
+        results.add(upload.result)
+    every = {UploadResult.ALL_NEW, UploadResult.ALL_OLD, UploadResult.REFUSED, UploadResult.PENDING_RESTORE}
+    assert results == every, "the fuzz reaches every end"
+
+
+def test_the_real_store_is_its_journal(tmp_path: Any) -> None:
+    rig = Rig()
+    with Store(tmp_path / "s.sqlite") as store:
+        rig.journal = store  # type: ignore[assignment]
+        assert rig.go(unix_offset_ns=5).result is UploadResult.ALL_NEW
+        row = store.last_restorable(1, 1, 97539)
+        assert row is not None and row.change == a_change() and store.pending() == []
+        undo = rig.go(row.change, undoes=row.id)
+        assert undo.result is UploadResult.ALL_OLD
+        assert rig.stored() == OLD
+        assert store.last_restorable(1, 1, 97539) is None
+
+
+def test_settings_can_only_tighten_the_limit() -> None:
+    rig = Rig()
+    upload = rig.go(settings=UploadSettings(offs_max_mg=60.0))
+    assert (upload.result, upload.reasons) == (UploadResult.REFUSED, (Reason.BEYOND_LIMIT,))
+    rig = Rig()
+    rig.vehicle.params["COMPASS_OFFS_MAX"] = 60.0
+    assert rig.go(settings=UploadSettings(offs_max_mg=900.0)).reasons == (Reason.BEYOND_LIMIT,)
