@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
+import subprocess
+import sys
 from itertools import islice
 from pathlib import Path
 
@@ -120,6 +123,33 @@ def test_an_old_recording_is_continued_and_never_overwritten(tmp_path: Path) -> 
         next(link.packets())
         link.close()
     assert recorded(tmp_path / "a.tlog") == [(0, wire[0]), (10**9, wire[1])]
+
+
+def test_another_programs_reader_reads_it_too(tmp_path: Path) -> None:
+    """pymavlink's own log reader, in a process of its own, finds the same messages at the same times."""
+    clock = SetClock()
+    here, there = pair(clock)
+    link = TlogRecorder(here, tmp_path / "a.tlog")
+    turns = link.packets()
+    for frame in frames(30):
+        clock.advance(0.5)
+        there.send(frame)
+        next(turns)
+    link.close()
+    program = (
+        "import sys; from pymavlink import mavutil; log = mavutil.mavlink_connection(sys.argv[1])\n"
+        "while m := log.recv_msg(): print(m.get_type(), round((m._timestamp - 1795000000) * 1000))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "a.tlog")],
+        env={**os.environ, "MAVLINK20": "1", "MAVLINK_DIALECT": "ardupilotmega"},
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=True,
+    )
+    want = [f"{'HEARTBEAT' if i % 3 else 'RAW_IMU'} {500 * (i + 1)}" for i in range(30)]
+    assert done.stdout.splitlines() == want
 
 
 class Disk:

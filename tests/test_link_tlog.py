@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import socket
 import struct
 import time
 from itertools import pairwise
@@ -14,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from magmav.link import LinkError, Packet
+from magmav.link.open import open_link
 from magmav.link.tlog import TlogLink
 from magmav.mavlink.codec import Codec
 
@@ -104,6 +106,16 @@ def test_sending_into_a_recording_is_counted_and_changes_nothing(tmp_path: Path)
     link.send(frame(1), "tlog")
     assert len(list(link.packets())) == 3
     assert link.counts["not sent"] == 2 and path.read_bytes() == before
+
+
+def test_a_recording_opens_no_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*args: object, **kwargs: object) -> None:
+        raise AssertionError("a socket was opened")
+
+    monkeypatch.setattr(socket, "socket", refused)
+    link = open_link(str(written(tmp_path / "a.tlog", *flight(3))))
+    link.send(frame(1))
+    assert len(list(link.packets())) == 3
 
 
 def test_closing_in_the_middle_ends_the_packets(tmp_path: Path) -> None:

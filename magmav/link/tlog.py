@@ -70,20 +70,20 @@ class TlogLink:
     def _look(self, path: Path) -> tuple[int, list[Packet]]:
         """The first batch; LinkError when the file's front holds none."""
         head = self._read(_FIRST_LOOK)
+        self._cutter.feed(head, last=self._done >= self._size)
+        batch = self._cutter.cut()
+        if batch[1]:
+            return batch
         for front, what in _OTHER_LOGS:
             if head.startswith(front):
                 raise LinkError(f"{path}: not a tlog: this is {what}; use a command that reads such logs")
-        self._cutter.feed(head, last=self._done >= self._size)
-        batch = self._cutter.cut()
-        if not batch[1]:
-            where = "in it" if self._done >= self._size else "in the first 1 MB"
-            bare = head[:1] in (b"\xfd", b"\xfe")
-            hint = " (MAVLink without times? a tlog has 8 bytes of time before each frame)" if bare else ""
-            raise LinkError(
-                f"{path}: not a tlog: no MAVLink record found {where}{hint}; "
-                "give a .tlog as written by a ground station, or check that the copy is whole"
-            )
-        return batch
+        where = "in it" if self._done >= self._size else "in the first 1 MB"
+        bare = head[:1] in (b"\xfd", b"\xfe")
+        hint = " (MAVLink without times? a tlog has 8 bytes of time before each frame)" if bare else ""
+        raise LinkError(
+            f"{path}: not a tlog: no MAVLink record found {where}{hint}; "
+            "give a .tlog as written by a ground station, or check that the copy is whole"
+        )
 
     def _more(self, size: int) -> bool:
         """Feed the cutter; False at the end of the file."""
