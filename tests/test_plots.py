@@ -101,6 +101,10 @@ def test_the_drawn_error_is_the_scored_error(tmp_path, flown):
 
 def test_offsets_are_drawn_with_their_sigma_and_what_is_not_known_is_left_out(tmp_path, flown):
     trace, _ = flown
+    nothing = np.full((len(trace.boot_s), 3), np.nan)
+    blank = replace(trace, offsets_mg=nothing, sigma_mg=nothing, corrected_b_mg=nothing)
+    said = words(plot_replay(tmp_path / "r.png", [blank], "t", None))
+    assert "x forward not known" in said and "z down not known (from field model)" in said
     figure = plot_replay(tmp_path / "r.png", [trace], "t", None)
     for i, label in enumerate(
         ("x forward -310 ± 2.0 mG", "y right 140 ± 3.0 mG", "z down -220 mG (from field")

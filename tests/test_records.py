@@ -53,10 +53,11 @@ def make(seed: int = 0, **changes: object) -> Record:
 
 def unknown_things() -> list[Record]:
     nothing = Verdict(State.NO_DATA, (AxisState.NOT_OBSERVED,) * 3, ())
+    unlearnt = replace(make(2).estimate, samples=0)
     sigma = np.array([1.5, math.inf, math.nan])
     return [
         make(1, device_id=0, heading=UNKNOWN, stored_heading=UNKNOWN, sigma_mg=sigma),
-        make(2, verdict=nothing),
+        make(2, verdict=nothing, estimate=unlearnt),
     ]
 
 

@@ -35,7 +35,7 @@ COMPASS = {
 RESULT = {
     "source": "thor75.tlog",
     "vehicles": [{"system": 7, "autopilot": 3, "compasses": [COMPASS]}],
-    "counts": {"bad crc": 3, "unknown": 0},
+    "counts": {"codec": {"bad crc": 3, "unknown": 0, "skipped": 2}, "link": {}, "late": 4, "early": 0},
 }
 
 
@@ -66,10 +66,16 @@ def test_a_recordings_table_says_what_the_json_says():
         "with an upload of offsets alone: 4.32 deg",
         "over 18359 samples, 220 to 588 s of boot time; left out: disarmed 123",
         "The autopilot holds: COMPASS_OFS2_X 12.5, COMPASS_OFS2_Y -3",
-        "Counted: bad crc 3",
+        "  codec: bad crc 3, skipped 2",
+        "  late: 4",
     ):
         assert words in text
-    assert "unknown 0" not in text and "follows its own compass" not in text
+    assert (
+        "unknown 0" not in text
+        and "link" not in text
+        and "early" not in text
+        and "follows its own compass" not in text
+    )
 
 
 def test_what_is_null_is_not_known_and_never_a_number():

@@ -95,10 +95,12 @@ def _block(block: SubFigure, trace: Trace, reference_name: str | None) -> None:
 def _offsets(axes: Axes, trace: Trace) -> None:
     for i, (name, colour) in enumerate(AXES):
         value, sigma = trace.offsets_mg[:, i], trace.sigma_mg[:, i]
-        end = f"{value[-1]:.0f} ± {sigma[-1]:.1f}" if np.isfinite(sigma[-1]) else f"{value[-1]:.0f}"
+        end = f"{value[-1]:.0f} mG" if np.isfinite(value[-1]) else "not known"
+        end = f"{value[-1]:.0f} ± {sigma[-1]:.1f} mG" if np.isfinite(sigma[-1]) else end
         axes.fill_between(trace.boot_s, value - sigma, value + sigma, color=colour, alpha=0.22, linewidth=0)
-        axes.plot(trace.boot_s, value, color=colour, lw=1.6, label=f"{name} {end} mG{_DOUBTS[trace.axes[i]]}")
-    low, high = np.percentile(trace.offsets_mg, (1, 99))
+        axes.plot(trace.boot_s, value, color=colour, lw=1.6, label=f"{name} {end}{_DOUBTS[trace.axes[i]]}")
+    known = trace.offsets_mg[np.isfinite(trace.offsets_mg)]
+    low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 0.0)
     room = max(0.15 * (high - low), 3.0 * _last_sigma(trace), 5.0)
     axes.set_ylim(low - room, high + room)  # the wide sigma of the first seconds would flatten all the rest
     axes.set_ylabel("offset, mG")

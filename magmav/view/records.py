@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from magmav.core.types import Record, State
+from magmav.core.types import Record
 
 Value = float | int | str | bool | list[str] | None
 Row = dict[str, Value]
@@ -73,7 +73,9 @@ _JSON_START = '{"t_s": '
 def row(record: Record) -> Row:
     """The record as it is written: times to 1 us, mG and degrees to 1e-4; None where nothing is known."""
     verdict, heading, stored = record.verdict, record.heading, record.stored_heading
-    known = verdict.state is not State.NO_DATA
+    known = (
+        record.estimate.samples > 0
+    )  # before that the offsets are where the estimator starts, not an answer
     true = heading.valid and heading.true_valid
     values: list[Value] = [
         round(record.t_ns / 1e9, 6),
@@ -101,7 +103,7 @@ def row(record: Record) -> Row:
 
 
 def _number(value: float, known: bool = True) -> float | None:
-    return round(float(value), 4) if known and math.isfinite(value) else None
+    return round(float(value), 4) + 0.0 if known and math.isfinite(value) else None  # + 0.0: no -0.0
 
 
 def _compass_deg(angle_rad: float, known: bool) -> float | None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -50,17 +51,14 @@ def replay_view(result: Json) -> RenderableType:
         parts += [Text(), _line(name, "bold")]
         parts += [_compass(compass) for compass in vehicle.get("compasses") or []]
         if not vehicle.get("compasses"):
-            parts.append(_line("  no compass was seen"))
+            parts.append(_para("  no compass was seen"))
     if not vehicles:
         parts.append(_line("no vehicle was seen"))
     if any(_reference(c).startswith("ATTITUDE") for v in vehicles for c in v.get("compasses") or []):
         parts += [Text(), _line(_FOLLOWS, "dim")]
-    counts = {name: count for name, count in (result.get("counts") or {}).items() if count}
+    counts = _counts(result.get("counts") or {})
     if counts:
-        parts += [
-            Text(),
-            _line("Counted: " + ", ".join(f"{_word(n)} {_word(c)}" for n, c in counts.items()), "dim"),
-        ]
+        parts += [Text(), _line("Counted:", "dim"), *(_para(f"  {line}", "dim") for line in counts)]
     return Group(*parts)
 
 
@@ -157,29 +155,29 @@ def _compass(compass: Json) -> RenderableType:
             _line(_number(_item(compass.get("sigma_mg"), i), ".1f")),
             _line(_AXES.get(str(axis), _word(axis))),
         )
-    lines = [Text.assemble(_line(head), verdict)]
-    lines += [_line(f"    - {_word(r.get('text') or r.get('code'))}") for r in compass.get("reasons") or []]
+    lines: list[RenderableType] = [Text.assemble(_line(head), verdict)]
+    lines += [_para(f"    - {_word(r.get('text') or r.get('code'))}") for r in compass.get("reasons") or []]
     stored = ", ".join(f"{_word(n)} {_number(v, 'g')}" for n, v in (compass.get("stored") or {}).items())
-    facts = [_line(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass)]
+    facts = [_para(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass)]
     return Group(Text(), *lines, table, *facts)
 
 
-def _headings(compass: Json) -> list[Text]:
+def _headings(compass: Json) -> list[RenderableType]:
     """What the numbers say about heading; offsets alone get their own line when that was scored."""
     heading = compass.get("heading")
     if not heading or heading.get("reference") is None:
-        return [_line("  Heading error: not known, there is no reference to measure it against")]
+        return [_para("  Heading error: not known, there is no reference to measure it against")]
     left_out = ", ".join(f"{_word(k)} {_word(n)}" for k, n in (heading.get("excluded") or {}).items())
     left_out = f"; left out: {left_out}" if left_out else ""
     if not heading.get("n"):
-        return [_line(f"  Heading error against {_word(heading['reference'])}: no sample to score{left_out}")]
+        return [_para(f"  Heading error against {_word(heading['reference'])}: no sample to score{left_out}")]
     span = f"{_number(heading.get('from_s'), '.0f')} to {_number(heading.get('to_s'), '.0f')} s"
     stored = heading.get("stored_rms_deg")
     stored = "" if stored is None else f", as stored {_number(stored)}"
     claim = heading.get("sigma_deg")
-    out = [
-        _line(f"  Heading RMS against {_word(heading['reference'])}:"),
-        _line(
+    out: list[RenderableType] = [
+        _para(f"  Heading RMS against {_word(heading['reference'])}:"),
+        _para(
             f"    uncalibrated {_number(heading.get('uncalibrated_rms_deg'))}{stored}"
             f" → corrected {_number(heading.get('rms_deg'))} deg"
             f" (95 % within {_number(heading.get('p95_deg'))}, one sigma claimed: {_number(claim)})"
@@ -187,8 +185,8 @@ def _headings(compass: Json) -> list[Text]:
     ]
     only = compass.get("heading_offsets_only")
     if only:
-        out.append(_line(f"    with an upload of offsets alone: {_number(only.get('rms_deg'))} deg"))
-    out.append(_line(f"    over {_word(heading.get('n'))} samples, {span} of boot time{left_out}", "dim"))
+        out.append(_para(f"    with an upload of offsets alone: {_number(only.get('rms_deg'))} deg"))
+    out.append(_para(f"    over {_word(heading.get('n'))} samples, {span} of boot time{left_out}", "dim"))
     return out
 
 
@@ -233,6 +231,21 @@ def _number(value: Any, form: str = ".2f") -> str:
 
 def _word(value: Any) -> str:
     return UNKNOWN if value is None else str(value)
+
+
+def _counts(counts: Json) -> list[str]:
+    """One line per part of the path that counted anything; a plain number stands under its own name."""
+    out = []
+    for name, count in counts.items():
+        kinds = count if isinstance(count, Mapping) else {"": count}
+        told = ", ".join(f"{_word(kind)} {_word(n)}".strip() for kind, n in kinds.items() if n)
+        out += [f"{_word(name)}: {told}"] if told else []
+    return out
+
+
+def _para(text: str, style: str = "") -> RenderableType:
+    """A paragraph that keeps its leading spaces on every line it is broken into."""
+    return Padding(_line(text.lstrip(" "), style), (0, 0, 0, len(text) - len(text.lstrip(" "))))
 
 
 def _line(text: str, style: str = "") -> Text:

@@ -21,7 +21,7 @@ _REBOOT_S = 1.0  # boot time falling back by more is a reboot; by less, a packet
 class Trace:
     """One compass of one vehicle over its boot time, since its last reboot.
 
-    Arrays are (N,) or (N, 3), angles in radians and NaN where not known, fields in mG and body axes.
+    Arrays are (N,) or (N, 3), NaN where not known; angles in radians, fields in mG and body axes.
     stored is what the autopilot's own values give, corrected what the estimate gives; expected_mg is the
     field strength the data imply. The rms, scored and frozen values come from a score, drawn as given.
     """
@@ -106,6 +106,7 @@ class TraceCollector:
 
 
 _COLUMNS = 18
+_NONE = (math.nan,) * 3
 
 
 class _Series:
@@ -160,14 +161,17 @@ class _Series:
 
 
 def _row(record: Record) -> tuple[float, ...]:
-    sigma = np.where(np.isfinite(record.sigma_mg), record.sigma_mg, np.nan)
     heading = record.heading
+    known = (
+        record.estimate.samples > 0
+    )  # before that the offsets are where the estimator starts, not an answer
+    sigma = record.sigma_mg if known else _NONE
     return (
         record.boot_ns / 1e9,
         *record.stored_b_mg,
-        *record.corrected_b_mg,
-        *record.offsets_mg,
-        *sigma,
+        *(record.corrected_b_mg if known else _NONE),
+        *(record.offsets_mg if known else _NONE),
+        *(value if math.isfinite(value) else math.nan for value in sigma),
         *_angles(record.stored_heading),
         *_angles(heading),
         heading.sigma_rad if heading.valid else math.nan,
