@@ -44,6 +44,12 @@ class Pipeline:
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
 
+    def apply(self, settings: Settings) -> None:
+        """Settings changed in flight: what is learnt stays."""
+        self.settings = settings
+        for vehicle in self.vehicles.values():
+            vehicle.apply(settings)
+
     def step(self, reading: Reading, t_ns: int) -> Record | None:
         """Take one reading that arrived at t_ns; a Record when it was a fresh magnetometer value."""
         vehicle = self.vehicles.get(reading.system)
@@ -75,6 +81,13 @@ class Vehicle:
         self._reboots = 0
         if not math.isnan(settings.place.lat_deg):
             self._place = (settings.place.lat_deg, settings.place.lon_deg, settings.place.alt_m)
+
+    def apply(self, settings: Settings) -> None:
+        """Take changed settings."""
+        self.settings = settings
+        self.learning = settings.learn.on
+        for channel in self.channels.values():
+            channel.limits = limits(settings)
 
     def step(self, r: Reading, t_ns: int, unix_ns: int) -> Record | None:
         """Hand one reading to whom it concerns."""
@@ -150,16 +163,8 @@ class Vehicle:
 
     def _channel(self, compass: int) -> Channel:
         if compass not in self.channels:
-            g = self.settings.gate
-            limits = gate.Limits(
-                g.axis_sigma_mg,
-                math.radians(g.heading_sigma_deg),
-                g.residual_mg,
-                g.field_share,
-                g.change_s,
-                g.samples,
-            )
-            self.channels[compass] = Channel(ESTIMATORS[self.settings.learn.estimator], limits, g.steady_s)
+            make = ESTIMATORS[self.settings.learn.estimator]
+            self.channels[compass] = Channel(make, limits(self.settings), self.settings.gate.steady_s)
         return self.channels[compass]
 
     def _settle(self, compass: int) -> None:
@@ -213,3 +218,10 @@ class Vehicle:
         self._first_ns = self._unix_minus_boot_ns = None
         for channel in self.channels.values():
             channel.restart()
+
+
+def limits(settings: Settings) -> gate.Limits:
+    """The gate's lines, in its own units."""
+    g = settings.gate
+    heading_rad = math.radians(g.heading_sigma_deg)
+    return gate.Limits(g.axis_sigma_mg, heading_rad, g.residual_mg, g.field_share, g.change_s, g.samples)

@@ -55,7 +55,7 @@ class Service:
         self.decoder = Decoder()
         self.codec = Codec(self.decoder.wanted if companion is None else None)
         self.heard: Counter[str] = Counter()
-        self._watchers = watchers
+        self.watchers = tuple(watchers)
         self._now_ns = 0
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -84,7 +84,7 @@ class Service:
             record = self.pipeline.step(reading, packet.t_ns)
             if record is not None and self.companion is not None:
                 self.companion.on_record(record, packet.t_ns)
-            for watch in self._watchers:
+            for watch in self.watchers:
                 watch(reading, record)
         if self.companion is not None:
             self._send(self.companion.on_message(message, packet.route, packet.t_ns))

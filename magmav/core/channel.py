@@ -69,7 +69,7 @@ class Channel:
 
     def __init__(self, make: Callable[[], Estimator], limits: gate.Limits, steady_s: float) -> None:
         self._make = make
-        self._limits = limits
+        self.limits = limits
         self._steady_s = steady_s
         self.verdict = gate.NOTHING
         self.held = False
@@ -181,4 +181,4 @@ class Channel:
             parameters_changed=c.parameters_changed,
             grounded=c.grounded,
         )
-        self.verdict = gate.judge(evidence, self._limits, self.verdict.state)
+        self.verdict = gate.judge(evidence, self.limits, self.verdict.state)

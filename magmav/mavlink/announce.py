@@ -35,16 +35,20 @@ class Announcer:
     """
 
     def __init__(self, budget: Budget, heading_hz: float = 2.0) -> None:
-        if not 0 <= heading_hz <= 50:
-            raise ValueError(f"heading_hz: want 0 (off) to 50 Hz, got {heading_hz!r}")
         self.counts: Counter[str] = Counter()
         self._budget = budget
-        self._period_ns = round(_SECOND / heading_hz) if heading_hz else 0
+        self.rate(heading_hz)
         self._headings: dict[int, _Heading] = {}
         self._due_ns: dict[int, int] = {}
         self._texts: deque[tuple[int, list[Message]]] = deque()
         self._said_ns: dict[tuple[int, str], int] = {}
         self._text_id = 0
+
+    def rate(self, heading_hz: float) -> None:
+        """How often each heading is sent; 0 for not at all."""
+        if not 0 <= heading_hz <= 50:
+            raise ValueError(f"heading_hz: want 0 (off) to 50 Hz, got {heading_hz!r}")
+        self._period_ns = round(_SECOND / heading_hz) if heading_hz else 0
 
     def heading(self, compass: int, degrees: float, boot_ns: int, now_ns: int) -> None:
         """The newest corrected magnetic heading of a compass, degrees; NaN when it is not known.

@@ -91,7 +91,9 @@ class Presence:
             self._heartbeat(message, sender, route, now_ns)
         if self.autopilot is not None and sender == self.autopilot.pin[:2]:
             self._heard(message, route, now_ns)
-        return [] if self.ambiguous else self._manners.reply(message, route, self.system, self.component)
+        if self.autopilot is None:
+            return []  # nobody yet: an answer would carry a made-up system id
+        return self._manners.reply(message, route, self.system, self.component)
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """Latch when it is time; our heartbeat once a second."""

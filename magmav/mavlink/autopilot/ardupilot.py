@@ -65,7 +65,7 @@ class Calibrations:
         self._held: dict[str, float] = {}
         self._epoch = dict.fromkeys(COMPASSES, 0)
         self._changed = dict.fromkeys(COMPASSES, False)
-        self._expected: dict[str, float] = {}
+        self._expected: dict[str, set[float]] = {}
         self._throttle: float | None = None
         self._ampere: float | None = None
         self._parts: dict[int, tuple[Vec3, Shaping]] = {}
@@ -81,7 +81,7 @@ class Calibrations:
             return ()
         self._parts.clear()
         changed = tuple(c for c in COMPASSES if self._correction(c) != before[c])
-        if self._expected.get(r.name) != r.value:
+        if r.value not in self._expected.get(r.name, ()):
             for c in changed:
                 self._epoch[c] += 1
                 self._changed[c] = self._changed[c] or was is not None
@@ -106,7 +106,8 @@ class Calibrations:
 
     def expect(self, names: Iterable[str], values: Iterable[float]) -> None:
         """These coming values are our own doing: undone exactly, nothing need be learnt again."""
-        self._expected.update(zip(names, values, strict=True))
+        for name, value in zip(names, values, strict=True):
+            self._expected.setdefault(name, set()).add(value)
 
     def forget(self) -> None:
         """The vehicle rebooted: everything must be read again."""

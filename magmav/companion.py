@@ -1,0 +1,287 @@
+"""Our component on the wire: who we are, what we ask for, what we publish, and the writes we are asked to make.
+
+Puts the protocol machines together; each of them takes messages and the time and gives messages back. Nothing is
+ever written to a vehicle unasked (S18).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+
+from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult, Verdict
+from magmav.mavlink.announce import Announcer
+from magmav.mavlink.autopilot.ardupilot import plan_change, wanted_names
+from magmav.mavlink.budget import Budget
+from magmav.mavlink.change import code_needed, largest_step_mg
+from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.fetch import ParamFetch
+from magmav.mavlink.intervals import Intervals
+from magmav.mavlink.params import ParamServer
+from magmav.mavlink.presence import Presence
+from magmav.mavlink.terms import UploadSettings
+from magmav.mavlink.upload import Upload
+from magmav.mavlink.watch import Watch
+from magmav.own_params import COMPASSES, entries
+from magmav.pipeline import Pipeline
+from magmav.pipeline import Vehicle as Flown
+from magmav.settings import Settings, SettingsError, with_value
+from magmav.store import SavedEstimate, Store, StoreError
+
+_log = logging.getLogger("magmav")
+_STALE_NS = 2_000_000_000
+_SAVE_EVERY_NS = 10_000_000_000
+_RETRY_RESTORE_NS = 30_000_000_000
+_CRITICAL, _WARNING, _INFO = 2, 4, 6
+_SLOW = (
+    "GLOBAL_POSITION_INT", "GPS_RAW_INT", "BATTERY_STATUS", "VFR_HUD", "SYSTEM_TIME", "EXTENDED_SYS_STATE",
+)  # fmt: skip
+
+
+def wanted_rates(settings: Settings) -> dict[str, float]:
+    """The messages we live on, and how often we ask for them."""
+    w = settings.wire
+    rates = dict.fromkeys(("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"), w.imu_hz)
+    rates |= {"ATTITUDE": w.attitude_hz} | dict.fromkeys(_SLOW, w.slow_hz)
+    return {name: hz for name, hz in rates.items() if hz > 0.0}
+
+
+class MagCompanion:
+    """Serves one vehicle. ``job`` is the write under way; ``ended`` the last one that came to an end."""
+
+    def __init__(
+        self, settings: Settings, pipeline: Pipeline, store: Store, unix_offset_ns: int, *, ask: bool = True
+    ) -> None:
+        self.settings = settings
+        self.confirm = 0.0
+        self.result = 0.0
+        self.job: Upload | None = None
+        self.ended: Upload | None = None
+        self.refusal: Reason | None = None
+        self._pipeline = pipeline
+        self._store = store
+        self._unix_offset_ns = unix_offset_ns
+        self._now_ns = 0
+        self._records: dict[int, Record] = {}
+        self._states: dict[int, State] = {}
+        self._saved_ns: dict[int, int] = {}
+        self._retry_ns = 0
+        v = settings.vehicle
+        self.presence = Presence(v.component, v.system or None)
+        self._watch = Watch(self.presence)
+        self._intervals = Intervals(wanted_rates(settings) if ask else {}, self.presence)
+        self._fetch = ParamFetch(wanted_names(COMPASSES), self.presence)
+        budget = Budget(settings.wire.budget_bps)
+        self.announcer = Announcer(budget, settings.wire.heading_hz)
+        self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, budget)
+
+    # ------------------------------------------------------------ what the service calls
+
+    @property
+    def settled(self) -> bool:
+        """The vehicle is known, and everything that must be read from it was read or is not there."""
+        return self.presence.autopilot is not None and self._fetch.done
+
+    def identity(self) -> tuple[int, int]:
+        """System and component we speak as."""
+        return self.presence.system, self.presence.component
+
+    def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
+        """Every machine hears everything."""
+        self._now_ns = now_ns
+        out = self.presence.on_message(message, route, now_ns)
+        self._watch.on_message(message, route, now_ns)
+        for machine in (self._intervals, self._fetch, self._server):
+            out += machine.on_message(message, route, now_ns)
+        if self.job is not None:
+            out += self.job.on_message(message, route, now_ns)
+        return out
+
+    def on_record(self, record: Record, now_ns: int) -> None:
+        """Publish what is new about a compass of the served vehicle."""
+        if record.system != self.presence.system:
+            return
+        self._records[record.compass] = record
+        heading = record.heading
+        degrees = math.degrees(heading.magnetic_rad) if heading.valid else math.nan
+        self.announcer.heading(record.compass, degrees, record.boot_ns, now_ns)
+        if self._states.get(record.compass) is not record.verdict.state:
+            self._states[record.compass] = record.verdict.state
+            self._say_verdict(record, now_ns)
+        if record.verdict.state is State.READY:
+            if now_ns - self._saved_ns.get(record.compass, -_SAVE_EVERY_NS) >= _SAVE_EVERY_NS:
+                self._save(record.compass, now_ns)
+
+    def poll(self, now_ns: int) -> list[Outgoing]:
+        """What is due from every machine, the write under way first."""
+        self._now_ns = now_ns
+        out: list[Outgoing] = []
+        if self.job is not None:
+            out += self.job.poll(now_ns)
+            self._finish(self.job, now_ns)
+        elif now_ns >= self._retry_ns:
+            self._restore_pending(now_ns)
+        for machine in (self.presence, self._intervals, self._fetch, self._server, self.announcer):
+            out += machine.poll(now_ns)
+        return out
+
+    def leave(self, now_ns: int) -> list[Outgoing]:
+        """Keep what is known, give the message intervals back."""
+        for compass, record in self._records.items():
+            if record.verdict.state is State.READY:
+                self._save(compass, now_ns)
+        return self._intervals.restore()
+
+    # ------------------------------------------------------------ what the parameters show and move
+
+    def record(self, compass: int, now_ns: int) -> Record | None:
+        """Latest Record of a compass, None when it is over two seconds old."""
+        record = self._records.get(compass)
+        return record if record is not None and now_ns - record.t_ns <= _STALE_NS else None
+
+    def choose(self, section: str, key: str, value: float) -> bool:
+        """Change one setting in flight; False when it is out of its limits."""
+        was = getattr(getattr(self.settings, section), key)
+        wanted: object = value
+        if isinstance(was, bool):
+            wanted = bool(value) if value in (0.0, 1.0) else value
+        try:
+            self.settings = with_value(self.settings, section, key, wanted)
+        except SettingsError:
+            return False
+        self._pipeline.apply(self.settings)
+        self.announcer.rate(self.settings.wire.heading_hz)
+        return True
+
+    def request_upload(self, compass: int, now_ns: int) -> None:
+        """Upload what is known now, if the gate says it may be."""
+        record = self.record(compass, now_ns)
+        change = self.plan(compass)
+        if self.job is not None:
+            self._refuse(Reason.BUSY, now_ns)
+        elif record is None or record.verdict.state is not State.READY:
+            self._refuse(Reason.NO_CALIBRATION, now_ns)
+        elif change is None:
+            self._refuse(Reason.NOT_OBSERVED, now_ns)
+        else:
+            self.start(change, int(self.confirm), now_ns)
+
+    def request_restore(self, compass: int, now_ns: int) -> None:
+        """Bring back the values from before the last upload of this compass."""
+        flown = self.flown()
+        device = 0 if flown is None else flown.calibrations.device_id(compass)
+        row = self._store.last_restorable(self.presence.system, compass, device)
+        if self.job is not None:
+            self._refuse(Reason.BUSY, now_ns)
+        elif row is None:
+            self._refuse(Reason.NO_SNAPSHOT, now_ns)
+        else:
+            self.start(row.change, None, now_ns, undoes=row.id)
+
+    # ------------------------------------------------------------ writing
+
+    def flown(self) -> Flown | None:
+        """The served vehicle in the pipeline."""
+        return None if self.presence.autopilot is None else self._pipeline.vehicles.get(self.presence.system)
+
+    def plan(self, compass: int) -> Change | None:
+        """The change the present estimate asks for, on the axes that are known; None when there is none."""
+        flown, record = self.flown(), self._records.get(compass)
+        if flown is None or record is None or record.estimate.samples == 0:
+            return None
+        x, y, z = (axis is not AxisState.NOT_OBSERVED for axis in record.verdict.axes)
+        iron = record.estimate.hard_iron_b_mg
+        return plan_change(flown.calibrations, self.presence.system, compass, iron, record.sigma_mg, (x, y, z))
+
+    def start(self, change: Change, confirm: int | None, now_ns: int, undoes: int | None = None) -> None:
+        """Begin a write; its messages come out of poll."""
+        limits = UploadSettings(confirm_above_mg=self.settings.upload.confirm_above_mg)
+        self.refusal = None
+        self.job = Upload(
+            change,
+            self._watch,
+            journal=self._store,
+            confirm=confirm,
+            undoes=undoes,
+            vehicle=str(change.system),
+            unix_offset_ns=self._unix_offset_ns,
+            settings=limits,
+        )
+        self.result = 1.0
+        flown = self.flown()
+        if flown is not None:
+            # The stream will jump by what we ourselves write: undone exactly, nothing is learnt again.
+            flown.calibrations.expect(change.names, change.old)
+            flown.calibrations.expect(change.names, change.new)
+        self.job.start(now_ns)
+        self._finish(self.job, now_ns)
+
+    def _finish(self, job: Upload, now_ns: int) -> None:
+        if job.result is None:
+            return
+        self.job, self.ended = None, job
+        code = float(job.result.value)
+        if job.result is UploadResult.REFUSED:
+            code = -float(job.reasons[0].number) if job.reasons else -1.0
+        self.result = code
+        worst = job.result in (UploadResult.PENDING_RESTORE, UploadResult.WRITTEN_UNPROVEN)
+        words = "; ".join(r.text for r in job.reasons)
+        _log.info("compass %d: %s", job.change.compass, job.progress)
+        text = f"MMAG c{job.change.compass} {job.result.name}" + (f": {words}" if words else "")
+        self.announcer.say(_CRITICAL if worst else _INFO, text, now_ns)
+        code_text = code_needed(job.change, self.settings.upload.confirm_above_mg)
+        if Reason.CONFIRM_CHANGE in job.reasons and code_text is not None:
+            step = largest_step_mg(job.change)
+            self.announcer.say(_WARNING, f"MMAG change of {step:.0f} mG: MMAG_CONFIRM {code_text}", now_ns)
+
+    def _refuse(self, reason: Reason, now_ns: int) -> None:
+        self.refusal = reason
+        self.result = -float(reason.number)
+        self.announcer.say(_WARNING, f"MMAG refused: {reason.text}", now_ns)
+
+    def _restore_pending(self, now_ns: int) -> None:
+        """A write that was cut short is taken back at the next chance; the machine itself checks that it may."""
+        autopilot = self.presence.autopilot
+        if autopilot is None or autopilot.armed or not self._watch.landed(now_ns):
+            return
+        self._retry_ns = now_ns + _RETRY_RESTORE_NS
+        try:
+            rows = [r for r in self._store.pending() if r.change.system == autopilot.system and r.undoes is None]
+        except StoreError as error:
+            _log.error("%s", error)
+            return
+        if rows:
+            self.announcer.say(_WARNING, "MMAG restoring a write that was cut short", now_ns)
+            self.start(rows[0].change, None, now_ns, undoes=rows[0].id)
+
+    # ------------------------------------------------------------ keeping and telling
+
+    def _save(self, compass: int, now_ns: int) -> None:
+        change, record = self.plan(compass), self._records[compass]
+        self._saved_ns[compass] = now_ns
+        if change is None:
+            return
+        three = tuple(float(v) for v in record.offsets_mg)
+        sigma = tuple(float(v) for v in record.sigma_mg)
+        saved = SavedEstimate(
+            now_ns + self._unix_offset_ns, str(change.system), change, record.verdict, three, sigma
+        )  # type: ignore[arg-type]
+        try:
+            self._store.save_estimate(saved)
+        except StoreError as error:
+            _log.error("%s", error)
+
+    def _say_verdict(self, record: Record, now_ns: int) -> None:
+        text = verdict_text(record.compass, record.verdict, float(np.max(record.sigma_mg[:2])))
+        _log.info("%s", text)
+        self.announcer.say(_WARNING if record.verdict.state is State.REFUSED else _INFO, text, now_ns)
+
+
+def verdict_text(compass: int, verdict: Verdict, sigma_mg: float) -> str:
+    """One line for a ground station: the state, and the first reason or how good it is."""
+    if verdict.state is State.READY:
+        return f"MMAG c{compass} READY, offsets +-{sigma_mg:.0f} mG"
+    first = f": {verdict.reasons[0].text}" if verdict.reasons else ""
+    return f"MMAG c{compass} {verdict.state.name}{first}"

@@ -1,0 +1,163 @@
+"""Live work on a link: the service until it is stopped, and one write or its undo from start to end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from magmav.companion import MagCompanion
+from magmav.core.types import Change, FieldModel, Reason, UploadResult
+from magmav.link import Link
+from magmav.mavlink.autopilot.ardupilot import offset_names
+from magmav.mavlink.change import code_needed, dry_run, largest_step_mg
+from magmav.pipeline import Pipeline
+from magmav.service import Service, Watcher
+from magmav.settings import Settings
+from magmav.store import Store, Write
+
+Result = dict[str, Any]
+_SECOND = 1_000_000_000
+
+
+class NoVehicle(Exception):
+    """Nobody to talk to within the time given; the text says what was waited for."""
+
+
+@dataclass(slots=True)
+class Session:
+    """A link with the whole machinery on it."""
+
+    service: Service
+    companion: MagCompanion
+    pipeline: Pipeline
+
+    @classmethod
+    def on(
+        cls, link: Link, settings: Settings, model: FieldModel, store: Store, watchers: Sequence[Watcher] = ()
+    ) -> Session:
+        """Build pipeline, companion and service for a link."""
+        pipeline = Pipeline(settings, model, link.unix_offset_ns)
+        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns)
+        return cls(Service(link, pipeline, companion, watchers), companion, pipeline)
+
+
+def transact(
+    session: Session,
+    link: Link,
+    compass: int,
+    pick: Callable[[int], Change | Write | Reason],
+    *,
+    confirm: int | None,
+    dry: bool,
+    wait_s: float,
+    progress: Callable[[str], None],
+    stop: Callable[[], bool] = lambda: False,
+) -> Result:
+    """Find the vehicle, read what it holds, then carry one change (or an undo) through, or only show it.
+
+    ``pick`` gets the device id and says what is to be written, or why nothing is. Raises NoVehicle.
+    """
+    companion = session.companion
+    begun_ns: int | None = None
+    shown = ""
+    chosen: Change | Write | Reason | None = None
+    packets = link.packets()
+    try:
+        for packet in packets:
+            session.service.turn(packet)
+            begun_ns = packet.t_ns if begun_ns is None else begun_ns
+            if stop():
+                break
+            if companion.ended is not None:
+                return outcome(companion.ended.change, companion.ended.result, companion.ended.reasons, confirm)
+            if chosen is None:
+                device = _device(session, compass)
+                if device:
+                    chosen = pick(device)
+                    change = chosen.change if isinstance(chosen, Write) else chosen
+                    if isinstance(change, Reason):
+                        return {"result": "REFUSED", "compass": compass, "reasons": _reasons((change,))}
+                    if dry:
+                        return _shown(change)
+                    undoes = chosen.id if isinstance(chosen, Write) else None
+                    companion.start(change, confirm, packet.t_ns, undoes)
+                elif packet.t_ns - begun_ns > wait_s * _SECOND:
+                    return _nobody(session, compass, link)
+            if companion.job is not None and companion.job.progress != shown:
+                shown = companion.job.progress
+                progress(shown)
+    finally:
+        for message, route in companion.leave(packet.t_ns if begun_ns is not None else 0):
+            with suppress(OSError):
+                link.send(session.service.codec.encode(message, *companion.identity()), route)
+    return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_LOST,))}
+
+
+def _device(session: Session, compass: int) -> int:
+    """Device id once everything the write rests on has been read, else 0."""
+    flown = session.companion.flown()
+    if flown is None or not flown.calibrations.known(compass):
+        return 0
+    return flown.calibrations.device_id(compass)
+
+
+def _nobody(session: Session, compass: int, link: Link) -> Result:
+    presence = session.companion.presence
+    if presence.ambiguous:
+        raise NoVehicle(f"{link.name}: several vehicles {presence.ambiguous}; choose one with --system")
+    if presence.autopilot is None:
+        raise NoVehicle(f"{link.name}: no autopilot heard; is the vehicle on, and does it send to this link?")
+    names = ", ".join(offset_names(compass))
+    return {
+        "result": "REFUSED",
+        "compass": compass,
+        "reasons": _reasons((Reason.UNKNOWN_PARAM,)),
+        "detail": f"no answer for {names} and the device id of compass {compass}",
+    }
+
+
+def _shown(change: Change) -> Result:
+    return outcome(change, None, (), None) | {"dry_run": True, "messages": dry_run(change)}
+
+
+def outcome(
+    change: Change, result: UploadResult | None, reasons: Sequence[Reason], confirm: int | None
+) -> Result:
+    """What a write did, as the JSON that the command prints."""
+    code = code_needed(change)
+    return {
+        "result": None if result is None else result.name,
+        "reasons": _reasons(reasons),
+        "system": change.system,
+        "compass": change.compass,
+        "device_id": change.device_id,
+        "old": dict(zip(change.names, change.old, strict=True)),
+        "new": dict(zip(change.names, change.new, strict=True)),
+        "largest_change_mg": round(largest_step_mg(change), 3),
+        "confirm_code": code,
+        "confirmed": code is not None and confirm == code,
+    }
+
+
+def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
+    return [{"code": r.name, "text": r.text} for r in reasons]
+
+
+def history_entry(row: Write) -> Result:
+    """One line of ``magmav history``."""
+    result = row.result
+    return {
+        "id": row.id,
+        "unix_s": row.unix_ns / 1e9,
+        "system": row.change.system,
+        "compass": row.change.compass,
+        "device_id": row.change.device_id,
+        "action": "upload" if row.undoes is None else f"undo of {row.undoes}",
+        "result": None if result is None else result.name,
+        "reasons": _reasons(row.reasons),
+        "undone": row.undone,
+        "old": dict(zip(row.change.names, row.change.old, strict=True)),
+        "new": dict(zip(row.change.names, row.change.new, strict=True)),
+    }
