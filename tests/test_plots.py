@@ -55,6 +55,12 @@ def flown():
     return trace, flight
 
 
+@pytest.fixture(scope="module")
+def picture(flown, tmp_path_factory):
+    """The flight drawn without a reference."""
+    return plot_replay(tmp_path_factory.mktemp("plots") / "r.png", [flown[0]], "t", None)
+
+
 def drawn(figure, title, label):
     """x and y of the one line with this label in the one panel with this title."""
     panels = [a for a in figure.get_axes() if a.get_title(loc="left").startswith(title)]
@@ -99,13 +105,9 @@ def test_the_drawn_error_is_the_scored_error(tmp_path, flown):
         assert "SIM yaw" in axes.get_title(loc="left")
 
 
-def test_offsets_are_drawn_with_their_sigma_and_what_is_not_known_is_left_out(tmp_path, flown):
+def test_offsets_are_drawn_with_their_sigma_and_what_is_not_known_is_left_out(picture, flown):
     trace, _ = flown
-    nothing = np.full((len(trace.boot_s), 3), np.nan)
-    blank = replace(trace, offsets_mg=nothing, sigma_mg=nothing, corrected_b_mg=nothing)
-    said = words(plot_replay(tmp_path / "r.png", [blank], "t", None))
-    assert "x forward not known" in said and "z down not known (from field model)" in said
-    figure = plot_replay(tmp_path / "r.png", [trace], "t", None)
+    figure = picture
     for i, label in enumerate(
         ("x forward -310 ± 2.0 mG", "y right 140 ± 3.0 mG", "z down -220 mG (from field")
     ):
@@ -119,9 +121,9 @@ def test_offsets_are_drawn_with_their_sigma_and_what_is_not_known_is_left_out(tm
     )
 
 
-def test_the_field_is_drawn_on_equal_axes_round_its_sphere(tmp_path, flown):
+def test_the_field_is_drawn_on_equal_axes_round_its_sphere(picture, flown):
     trace, _ = flown
-    figure = plot_replay(tmp_path / "r.png", [trace], "t", None)
+    figure = picture
     for title, across, up in (("Field from above (circle: 477 mG)", 1, 0), ("Field from the side", 0, 2)):
         x, y = drawn(figure, title, "corrected")
         assert np.array_equal(x, trace.corrected_b_mg[:, across]) and np.array_equal(
@@ -159,7 +161,10 @@ def test_every_compass_has_its_block_and_the_picture_is_a_png(tmp_path, flown):
         for name in Trace.__slots__
         if isinstance(getattr(trace, name), np.ndarray)
     })  # fmt: skip
-    figure = plot_replay(path, [short, replace(short, compass=3, device_id=0, reboots=1)], "t", None)
+    nothing = np.full((2, 3), np.nan)
+    blank = replace(short, compass=3, device_id=0, reboots=1, offsets_mg=nothing, sigma_mg=nothing)
+    figure = plot_replay(path, [short, replace(blank, corrected_b_mg=nothing)], "t", None)
+    assert "x forward not known" in words(figure) and "z down not known (from field model)" in words(figure)
     assert [s.get_suptitle() for s in figure.subfigs] == [
         "System 1, compass 2, device 97539: ready",
         "System 1, compass 3: ready, after 1 reboot(s)",
