@@ -97,6 +97,14 @@ def test_a_heading_just_under_north_is_zero_and_never_360():
     assert row(make(heading=Heading(True, True, -1e-12, 2 * math.pi - 1e-9, 0.1)))["heading_true_deg"] == 0.0
 
 
+def test_a_heading_without_declination_is_magnetic_only():
+    got = row(
+        make(heading=Heading(True, False, 1.0, 2.0, 0.1), stored_heading=Heading(True, True, 1.0, 2.0, 0.1))
+    )
+    assert (got["heading_deg"], got["heading_true_deg"]) == (57.2958, None)
+    assert (got["stored_heading_deg"], got["stored_heading_true_deg"]) == (57.2958, 114.5916)
+
+
 def test_what_is_not_known_is_none_and_never_zero():
     blind, empty = map(row, unknown_things())
     for name in ("device_id", "heading_deg", "heading_true_deg", "heading_sigma_deg", "stored_heading_deg"):
