@@ -22,6 +22,9 @@ class Demand(NamedTuple):
 Flying = Generator[Demand, State, None]
 
 
+_BANK_RATE_RADS = math.radians(25)
+
+
 class Tuning(NamedTuple):
     """What differs between the planes. Gains are stick per rad and per rad/s."""
 
@@ -40,7 +43,7 @@ class Tuning(NamedTuple):
 
 TUNINGS = {
     "c172x": Tuning(50.0, 32.0, 0.8, 0.25, 2.0, 0.8, 0.8, 0.3, 0.65, 0.03, True),
-    "minisgs": Tuning(14.0, 10.0, 0.5, 0.10, 0.8, 0.25, 0.3, 0.1, 0.0, -0.2, False),
+    "minisgs": Tuning(14.0, 10.0, 0.5, 0.10, 0.8, 0.25, 0.3, 0.6, 0.0, -0.2, False),
 }
 
 
@@ -51,6 +54,7 @@ class PlanePilot:
         self._tune = TUNINGS[model]
         self._pitch_sum = 0.0
         self._roll_sum = 0.0
+        self._bank = 0.0
         self._path_sum = 0.0
         self._power = self._tune.cruise_throttle
 
@@ -95,7 +99,8 @@ class PlanePilot:
             + tune.pitch_sum * self._pitch_sum
             + tune.pitch_damp * (q_turn - state.q_rads)
         )
-        roll_miss = demand.bank_rad - state.roll_rad
+        self._bank += _limit(demand.bank_rad - self._bank, _BANK_RATE_RADS * FRAME_S)
+        roll_miss = self._bank - state.roll_rad
         self._roll_sum = _limit(self._roll_sum + 0.3 * roll_miss * FRAME_S, 0.15)
         aileron = tune.roll * roll_miss + self._roll_sum - tune.roll_damp * state.p_rads
         rudder = -tune.yaw_damp * (r_turn - state.r_rads)

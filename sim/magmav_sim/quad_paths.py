@@ -68,8 +68,9 @@ def _hold(state: State, height_m: float, seconds: float) -> Flying:
 def _takeoff(pattern: Takeoff, state: State) -> Flying:
     north, east, heading, height = state.north_m, state.east_m, state.heading_rad, state.height_m
     while height < pattern.height_m:
-        height = min(pattern.height_m, height + pattern.climb_mps * FRAME_S)
-        state = yield Demand(north, east, height, 0, 0, pattern.climb_mps, heading)
+        climb = min(pattern.climb_mps, math.sqrt(2 * 0.8 * (pattern.height_m - height)) + 0.05)
+        height = min(pattern.height_m, height + climb * FRAME_S)
+        state = yield Demand(north, east, height, 0, 0, climb, heading)
     for _ in range(round(_LEAD_IN_S / FRAME_S)):
         yield Demand(north, east, pattern.height_m, 0, 0, 0, heading)
 
