@@ -24,6 +24,7 @@ def make(seed: int = 0, **changes: object) -> Record:
     def v(size: float) -> np.ndarray:
         return vec3(rng.normal(0, size, 3), "v")
 
+    age = {"age_s": 0.02} if "age_s" in Record.__slots__ else {}  # a field on its way in
     estimate = Estimate(v(300), np.eye(3), v(5), 200.0, 400.0, 3.0, 1.0, 100, 1e9)
     out = Record(
         t_ns=1_700_000_000_123_456_789 + seed * 20_000_000,
@@ -47,6 +48,7 @@ def make(seed: int = 0, **changes: object) -> Record:
             (Reason.Z_NOT_OBSERVED, Reason.STILL_MOVING),
         ),
         learnt=True,
+        **age,
     )
     return replace(out, **changes)
 
