@@ -7,6 +7,7 @@ import random
 import socket
 import struct
 import time
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from magmav.link import LinkError, Packet
+from magmav.link.cutter import RecordCutter
 from magmav.link.open import open_link
 from magmav.link.tlog import TlogLink
 from magmav.mavlink.codec import Codec
@@ -268,6 +270,36 @@ def test_anything_cut_out_or_put_in_spares_what_is_far_from_it(
         return
     want = [r[8:] for i, r in enumerate(RECORDS) if all(abs(i - w) > 2 for w in wounds)]
     assert [f for f in frames_of(packets) if f in set(want)] == want
+
+
+@quick
+@given(
+    at=st.integers(0, len(WHOLE) - 1), mask=st.integers(0, 255), size=st.integers(40, 4000), new=st.binary()
+)
+def test_the_pieces_a_file_is_read_in_change_nothing(at: int, mask: int, size: int, new: bytes) -> None:
+    hurt = bytearray(WHOLE)
+    hurt[at] ^= mask
+    hurt[at // 2 : at // 2] = new
+    results = []
+    for step in (size, len(hurt)):
+        counts: Counter[str] = Counter()
+        cutter, packets = RecordCutter(counts, "tlog"), list[Packet]()
+        for start in range(0, len(hurt), step):
+            cutter.feed(bytes(hurt[start : start + step]), last=start + step >= len(hurt))
+            while batch := cutter.cut()[1]:
+                packets += batch
+        results.append((packets, counts))
+    assert results[0] == results[1]
+
+
+def test_a_header_with_nothing_behind_it_swallows_no_record(tmp_path: Path) -> None:
+    """The front of a record that was never finished: its length reaches over the next two records."""
+    records = flight(20)
+    for half in (records[9][:30], record(START_US + 190_000, frame(99, 90))[:20]):
+        packets, _ = read(written(tmp_path / "a.tlog", *records[:9], half, *records[10:]))
+        assert frames_of(packets) == [r[8:] for r in records[:9] + records[10:]]
+        packets, _ = read(written(tmp_path / "a.tlog", *records[:9], b"noise", half, *records[10:]))
+        assert frames_of(packets) == [r[8:] for r in records[:9] + records[10:]]
 
 
 @quick

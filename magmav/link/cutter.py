@@ -14,7 +14,6 @@ from magmav.link.records import (
     find_record,
     plausible,
     record_size,
-    run_length,
 )
 
 _SECOND_US = 1_000_000
@@ -42,6 +41,7 @@ class RecordCutter:
         self._end = 0
         self._stamp_us: int | None = None  # last believed time
         self._lost = True
+        self._skipped = 0  # bytes since the chain broke
 
     def feed(self, data: bytes, *, last: bool) -> None:
         """More of the file; ``last``: nothing follows."""
@@ -110,10 +110,8 @@ class RecordCutter:
             after == len(data) and self._last
         ):
             self._next(out, end, None)
-        elif run_length(data, end, last=self._last) >= RUN:
-            self._next(out, end, then_us)
         else:
-            self._break(out)
+            self._break(out)  # a clock set by more than a day is found from there
 
     def _break(self, out: list[Packet]) -> None:
         """Nothing believable is behind the current record: one of the two is damaged, or the file ends."""
@@ -141,16 +139,21 @@ class RecordCutter:
             if self._last and len(rest) < LONGEST_RECORD and _begins_a_record(rest, self._stamp_us):
                 self._counts["truncated"] += 1
             else:
-                self._counts["garbage bytes"] += len(rest)
+                self._skipped += len(rest)
             self._at = stop
+        if self._last and self._skipped:
+            self._counts["garbage bytes"] += self._skipped
+            self._skipped = 0
         return False
 
     def _begin(self, found: int) -> None:
         """Take up the chain at ``found``; what lies between is damage."""
         data = self._data
-        if found > self._at:
-            self._counts["garbage bytes"] += found - self._at
+        self._skipped += found - self._at
+        if self._skipped:
+            self._counts["garbage bytes"] += self._skipped
             self._counts["resync"] += 1
+        self._skipped = 0
         stamp_us, magic, length, flags = HEAD.unpack_from(data, found)
         self._lost = False
         self._take(found, found + record_size(magic, length, flags), stamp_us)
