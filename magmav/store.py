@@ -213,7 +213,12 @@ class Store:
     def _connect(self) -> sqlite3.Connection:
         db = sqlite3.connect(self.path, isolation_level=None, timeout=5.0)
         try:
+            db.execute("BEGIN")  # both at one instant: another process may be creating it right now
             version = db.execute("PRAGMA user_version").fetchone()[0]
+            tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+            db.execute("COMMIT")
+            if version == 0 and tables:
+                raise StoreError(f"{self.path}: a database of something else, not a magmav store")
             if version > FORMAT:
                 raise StoreError(
                     f"{self.path}: format {version} is newer than this magmav's {FORMAT}; update magmav"
@@ -230,8 +235,6 @@ class Store:
     def _create(self, db: sqlite3.Connection) -> None:
         db.execute("BEGIN IMMEDIATE")
         if db.execute("PRAGMA user_version").fetchone()[0] == 0:  # nobody else was quicker
-            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
-                raise StoreError(f"{self.path}: a database of something else, not a magmav store")
             for statement in filter(str.strip, _TABLES.split(";")):
                 db.execute(statement)
             db.execute(f"PRAGMA user_version={FORMAT}")

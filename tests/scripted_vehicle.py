@@ -1,7 +1,8 @@
 """A scripted ArduPilot for the tests of the wire machines: plain Python, its own clock, seeded damage.
 
-Written from what ArduPilot was observed to do (echo with index 65535, silence on unknown names, offsets added to the
-stream at once, no arm check on PARAM_SET), not from the code under test. Messages cross a real encode and decode.
+Written from what ArduPilot was observed to do (echo with index 65535, silence on unknown names, offsets
+added to the stream at once, no arm check on PARAM_SET), not from the code under test. Messages cross a real
+encode and decode.
 """
 
 from __future__ import annotations

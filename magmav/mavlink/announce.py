@@ -37,6 +37,7 @@ class Announcer:
     def __init__(self, budget: Budget, heading_hz: float = 2.0) -> None:
         self.counts: Counter[str] = Counter()
         self._budget = budget
+        self._share = Budget(max(budget.bps / 2, 100.0))  # headings leave half for texts and parameters
         self.rate(heading_hz)
         self._headings: dict[int, _Heading] = {}
         self._due_ns: dict[int, int] = {}
@@ -98,6 +99,8 @@ class Announcer:
                 break
             self._texts.popleft()
             self.counts["texts"] += 1
+        if self._texts:
+            return out  # a text is longer than a heading and would never find the bucket full enough
         for compass, held in self._headings.items():
             out += self._send_heading(compass, held, now_ns)
         return out
@@ -108,8 +111,9 @@ class Announcer:
         if not self._period_ns or held.sent or stale or now_ns < due_ns:
             return []
         message = dialect.MAVLink_named_value_float_message(held.boot_ms, _NAMES[compass], held.degrees)
-        if not self._budget.take(message, now_ns):
+        if not (self._budget.has(message, now_ns) and self._share.take(message, now_ns)):
             return []
+        self._budget.take(message, now_ns)
         held.sent = True
         late = now_ns - due_ns > self._period_ns
         self._due_ns[compass] = (now_ns if late else due_ns) + self._period_ns

@@ -15,7 +15,8 @@ class Budget:
 
     bps : bytes per second (500 by default, users.md AT-9c). Any ten seconds see at most 10 * bps bytes of
     what ``take`` let through; what is ``force``d (heartbeat, critical text, echo of a SET) is paid back by
-    the rest.
+    the rest. Whoever sends for a machine that knows no budget (presence, intervals, fetch, upload) forces
+    it too.
     """
 
     def __init__(self, bps: float = 500.0, *, signed: bool = False) -> None:
@@ -31,12 +32,15 @@ class Budget:
 
     def take(self, message: Message, now_ns: int, reserve: float = 0.0) -> bool:
         """May this be sent now? Counts it if so. ``reserve``: bytes to leave for what matters more."""
-        self._fill(now_ns)
-        size = self.size(message)
-        if self._tokens - size < reserve:
+        if not self.has(message, now_ns, reserve):
             return False
-        self._tokens -= size
+        self._tokens -= self.size(message)
         return True
+
+    def has(self, message: Message, now_ns: int, reserve: float = 0.0) -> bool:
+        """Would ``take`` say yes? Counts nothing."""
+        self._fill(now_ns)
+        return self._tokens - self.size(message) >= reserve
 
     def force(self, message: Message, now_ns: int) -> None:
         """Count a message that is sent in any case."""

@@ -119,7 +119,7 @@ class Intervals:
         stream = self._streams[name]
         stream.tries += 1
         stream.changed = True
-        stream.next_ns = now_ns + stream.pause_ns
+        stream.next_ns = max(stream.next_ns, now_ns + FIRST_PAUSE_NS)
         self._waiting, self._sent_ns = name, now_ns
         return _command(autopilot, name, stream.interval_us)
 

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from magmav.mavlink.codec import Message, Outgoing
 
 _ADDRESSED = ("COMMAND_LONG", "COMMAND_INT", "FILE_TRANSFER_PROTOCOL")
+_PING_REPEATS = 3
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 _FTP_FIRST_REPLY = 128  # opcodes from here on are answers; answering an answer would never end
@@ -19,7 +20,7 @@ class Manners:
     """Replies as (system, component) to what is addressed to exactly that, and to everybody's PING."""
 
     def __init__(self) -> None:
-        self._pinged: dict[tuple[int, int], tuple[int, int]] = {}
+        self._pinged: dict[tuple[int, int], tuple[tuple[int, int], int]] = {}
 
     def reply(self, message: Message, route: str, system: int, component: int) -> list[Outgoing]:
         """Zero or one answer to one message; broadcast or others' commands are nobody's business here."""
@@ -41,15 +42,17 @@ class Manners:
         return [] if answer is None else [Outgoing(answer, route)]
 
     def _ping(self, message: Message, sender: tuple[int, int], we: tuple[int, int]) -> Message | None:
-        """A request has target 0/0. One addressed to us may be a request or somebody's answer to an answer,
-        so the same one is answered once: two such components would otherwise play for ever."""
+        """A request has target 0/0. One addressed to us may be a request or an answer to our answer, so
+        the same one is answered a few times only: two such components would otherwise play for ever."""
         target = _target(message)
         if target not in ((0, 0), we) or sender == we:
             return None
         what = message.time_usec, message.seq
-        if target == we and self._pinged.get(sender) == what:
+        last, times = self._pinged.get(sender, (what, 0))
+        times = times + 1 if last == what else 1
+        if target == we and times > _PING_REPEATS:
             return None
-        self._pinged[sender] = what
+        self._pinged[sender] = what, times
         return dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender)
 
 

@@ -38,7 +38,7 @@ class UploadSettings:
     watch_ns: int = 2500 * _MS  # long enough for two heartbeats of a second route
     baseline_ns: int = 8000 * _MS
     write_tries: int = 6
-    read_tries: int = 10
+    read_tries: int = 16
     rounds: int = 3
     settle_ns: int = 500 * _MS
     proof_ns: int = 6000 * _MS
