@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from magmav.link import LinkError, Packet
+from magmav.link.memory import SetClock
 from magmav.link.reopen import Backoff
 from magmav.link.serial import serial
 from magmav.link.stream import StreamLink
@@ -177,6 +178,59 @@ def test_a_tcp_link_closes_from_a_signal_handler_and_from_another_thread(pair: P
         assert all(p.data == b"" for p in other.packets())
         timer.join()
     assert link.counts["lost"] == 0
+
+
+class Wire:
+    """A port on a socket pair, whose far end the test holds."""
+
+    def __init__(self) -> None:
+        self._near, self.far = socket.socketpair()
+        self._near.setblocking(False)
+        self.fd = self._near.fileno()
+
+    def opened(self) -> bool:
+        return True
+
+    def read(self) -> bytes:
+        if data := self._near.recv(1000):
+            return data
+        raise ConnectionResetError
+
+    def write(self, data: bytes, /) -> int:
+        return self._near.send(data[:100])  # takes a little, like a slow radio
+
+    def close(self) -> None:
+        self._near.close()
+
+
+def test_a_lost_port_is_tried_ever_more_rarely_until_it_has_spoken_again() -> None:
+    clock, wires, tried_s = SetClock(), [Wire()], list[float]()
+
+    def reopen() -> Wire:
+        tried_s.append(clock.now_ns / 1e9)
+        if len(tried_s) % 4:
+            raise OSError("not yet")
+        wires.append(Wire())
+        return wires[-1]
+
+    with closing(StreamLink("wire", wires[0], reopen, tick_s=0.001, clock_ns=clock)) as link:
+        turns = link.packets()
+        link.send(b"x" * 300)  # 200 of it wait when the port dies, and must die with it
+        for life in (1, 2):
+            began_s = clock.now_ns / 1e9
+            wires[-1].far.close()
+            tried_s.clear()
+            while link.counts["reopened"] < life:
+                assert next(turns).data == b""
+                clock.advance(0.1)
+            assert [round(t - began_s, 1) for t in tried_s] == [0.5, 1.5, 3.5, 7.5]
+            wires[-1].far.send(b"alive")
+            assert next(turns)[1:] == (b"alive", f"wire#{life + 1}")
+            link.send(b"hello")
+            next(turns)
+            assert wires[-1].far.recv(1000) == b"hello"
+    wires[-1].far.close()
+    assert link.counts["lost"] == 2 and link.counts["open failed"] == 6
 
 
 def test_backoff_doubles_to_its_limit_and_starts_over_once_bytes_come() -> None:

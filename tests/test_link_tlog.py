@@ -302,6 +302,15 @@ def test_a_header_with_nothing_behind_it_swallows_no_record(tmp_path: Path) -> N
         assert frames_of(packets) == [r[8:] for r in records[:9] + records[10:]]
 
 
+def test_a_false_start_from_another_year_does_not_set_the_time(tmp_path: Path) -> None:
+    records = flight(20)
+    packets, link = read(written(tmp_path / "a.tlog", record(4 * START_US // 3, frame(99)), *records))
+    assert [(p.t_ns // 1000, p.data) for p in packets] == [
+        (START_US + i * 20_000, r[8:]) for i, r in enumerate(records)
+    ]
+    assert link.unix_offset_ns == 0 and link.counts["clock set"] == 0
+
+
 @quick
 @given(cut=st.integers(0, len(WHOLE)))
 def test_a_file_cut_anywhere_gives_every_record_before_the_cut(tmp_path: Path, cut: int) -> None:

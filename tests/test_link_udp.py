@@ -94,11 +94,23 @@ def test_a_peer_silent_for_thirty_seconds_is_forgotten(peers: list[socket.socket
         new.sendto(b"2", ("127.0.0.1", link.port))
         some(link, 1)
         clock.advance(10.0)
-        assert link.routes == (route_of(old), route_of(new))
+        link.send(b"to both, just in time")
+        assert old.recv(100) == new.recv(100) == b"to both, just in time"
         clock.advance(0.001)
         link.send(b"only the new one")
         assert link.routes == (route_of(new),) and link.counts["peers forgotten"] == 1
         assert new.recv(100) == b"only the new one" and nothing_waits(old)
+
+
+def test_a_peer_that_keeps_talking_is_kept(peers: list[socket.socket]) -> None:
+    clock = SetClock()
+    with closing(udp_in("", 0, clock_ns=clock)) as link:
+        for _ in range(4):
+            peers[0].sendto(b"here", ("127.0.0.1", link.port))
+            some(link, 1)
+            clock.advance(20.0)
+            link.send(b"there")
+            assert peers[0].recv(100) == b"there"
 
 
 def test_the_seventeenth_peer_is_not_heard_until_another_falls_silent(peers: list[socket.socket]) -> None:

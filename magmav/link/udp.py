@@ -122,9 +122,9 @@ class UdpLink:
 
     def _greet(self, address: Address, now_ns: int) -> str:
         """The route of a new peer, or "" when it is not wanted."""
-        if not self._fixed and len(self._route) >= self._most_peers:
+        if len(self._route) >= self._most_peers:
             self._forget(now_ns)
-        if self._fixed or len(self._route) >= self._most_peers:
+        if len(self._route) >= self._most_peers:
             self.counts["wrong source" if self._fixed else "too many peers"] += 1
             return ""
         return self._route.setdefault(address, udp_route(address))
