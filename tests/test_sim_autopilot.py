@@ -215,6 +215,15 @@ def test_arming_is_refused_without_offsets_when_checks_are_on():
     assert ground.command(400, 1) == ACCEPTED
 
 
+def test_flight_that_may_not_arm_waits_and_gives_up():
+    body = COMPASS + "[autopilot.parameters]\nARMING_CHECK = 1\n"
+    body += '[[flight]]\nground_s = 1.0\nwait_s = 10.0\npattern = [{ kind = "takeoff" }, { kind = "land" }]\n'
+    sim = simulation(body, top="end_ground_s = 1.0")
+    sim.advance(30.0)
+    assert sim.finished and sim.elapsed_ns / 1e9 == pytest.approx(12, abs=0.1)
+    assert sim.autopilot.events == []
+
+
 def test_standing_armed_it_disarms_after_ten_seconds(ground):
     ground.command(400, 1)
     ground.run(9.0)

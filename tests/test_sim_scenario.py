@@ -55,7 +55,8 @@ FLIGHT = '[[flight]]\npattern = [{ kind = "takeoff" }, { kind = "land" }]\n'
         (HEAD.replace("2026-11", "2035-11") + COMPASS, ("date", "2035")),
         (HEAD.replace("10:00:00Z", "10:00:00") + COMPASS, ("date", "2026")),
         (HEAD, ("compass",)),
-        (HEAD + COMPASS.replace("100.0, -50.0", "nan, -50.0"), ("compass[0]", "nan")),
+        (HEAD + COMPASS.replace("100.0, -50.0", "nan, -50.0"), ("compass[0].hard_iron_mg[0]", "nan")),
+        (HEAD.replace("alt_m = 488.0", "alt_m = inf") + COMPASS, ("place.alt_m", "inf")),
         ("seed = = 1", ("not TOML",)),
     ],
 )  # fmt: skip
@@ -67,7 +68,12 @@ def test_wrong_scenario_is_refused_naming_file_key_and_value(text, words):
 
 
 @pytest.mark.parametrize(
-    "extra", ["[autopilot]\nrates_hz = { NONSENSE = 5 }\n", "[autopilot.parameters]\nNONSENSE = 1.0\n"]
+    "extra",
+    [
+        "[autopilot.parameters]\nNONSENSE = 1e300\n",
+        "[autopilot]\nrates_hz = { NONSENSE = 5 }\n",
+        "[autopilot.parameters]\nNONSENSE = 1.0\n",
+    ],
 )
 def test_unknown_names_of_the_autopilot_are_refused(extra):
     with pytest.raises(ScenarioError, match="NONSENSE"):

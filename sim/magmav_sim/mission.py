@@ -68,10 +68,14 @@ class Mission:
             yield self.state
 
     def _before(self, flight: Flight) -> Generator[State, None, bool]:
-        """On the ground until armed for this flight; False when the wait for a command was too long."""
+        """On the ground until armed for this flight; False when that took too long."""
         if flight.start == "auto":
             yield from self._stand(flight.ground_s)
+            left_s = flight.wait_s
             while not self._a.arm():
+                if left_s <= 0:
+                    return False
+                left_s -= _RETRY_S
                 yield from self._stand(_RETRY_S)
         else:
             self._waiting, self._called, left = True, False, round(flight.wait_s / FRAME_S)

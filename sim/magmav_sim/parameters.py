@@ -7,6 +7,7 @@ import struct
 from collections.abc import Iterator
 
 INT8, INT16, INT32, REAL32 = 2, 4, 6, 9
+_BIGGEST_FLOAT32 = 3.4028234663852886e38
 _RANGE = {INT8: (-128, 127), INT16: (-32768, 32767), INT32: (-2147483648, 2147483647)}
 
 
@@ -97,8 +98,8 @@ class Parameters:
         kind = self._kinds.get(name)
         if kind is None:
             raise ValueError(f"parameters: no parameter {name!r}")
-        if not math.isfinite(value):
-            raise ValueError(f"parameters: {name} must be finite, got {value}")
+        if not abs(value) <= _BIGGEST_FLOAT32:
+            raise ValueError(f"parameters: {name} must be a finite float32, got {value}")
         if kind == REAL32:
             self._values[name] = struct.unpack("<f", struct.pack("<f", value))[0]
         else:

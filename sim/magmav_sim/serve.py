@@ -38,6 +38,7 @@ class Pacer:
             self._start_ns = self._answered_at_ns = now_ns
         if self._speed is not None:
             return int((now_ns - self._start_ns) * self._speed)
+        pong = min(pong, elapsed_ns // _PING_EVERY_NS)  # nobody answers what was not asked
         if pong > self._pong:
             self._pong, self._answered_at_ns, self._slow_from = pong, now_ns, None
         limit = self._pong * _PING_EVERY_NS + _WINDOW_NS
