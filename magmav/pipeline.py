@@ -142,6 +142,7 @@ class Vehicle:
             compass=compass,
             device_id=held.device_id(compass),
             boot_ns=r.boot_ns,
+            age_s=sample.age_s,
             mag_b_mg=sample.mag_b_mg,
             corrected_b_mg=finding.corrected_b_mg,
             stored_b_mg=r.field_b_mg,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magmav.core.types import AttitudeReading, FieldModel, Reading, Record, State
+from magmav.core.types import AttitudeReading, FieldModel, Heading, Reading, Record, State
 from magmav.link import Link
 from magmav.pipeline import Pipeline, Vehicle
 from magmav.reference import Reference
@@ -68,11 +68,10 @@ class Keeper:
         log = self.compasses.setdefault((record.system, record.compass), _CompassLog())
         shaping = vehicle.calibrations.shaping(record.compass)
         motor = np.linalg.solve(shaping.matrix, shaping.motor_b_mg)
-        heading = record.heading if record.heading.true_valid else record.stored_heading
-        known = heading.true_valid
+        heading = record.stored_heading
         log.records.append(record)
         log.shaped.append(record.mag_b_mg + motor)
-        log.declination_rad.append(heading.true_rad - heading.magnetic_rad if known else math.nan)
+        log.declination_rad.append(heading.true_rad - heading.magnetic_rad if heading.true_valid else math.nan)
 
     def _forget(self, system: int, reboots: int) -> None:
         self._reboots[system] = reboots
@@ -81,14 +80,14 @@ class Keeper:
         for key in [k for k in self.compasses if k[0] == system]:
             del self.compasses[key]
 
-    def reference(self, system: int) -> Reference | None:
-        """The vehicle's own attitude over time, with its phases of flight."""
-        kept = self.attitudes.get(system)
-        if not kept:
-            return None
-        flags = np.array(self.flags[system])
-        reference = Reference.from_attitude(kept, f"{kept[0].source} yaw")
-        if flags.all():
+    def reference(self, system: int, truth: Reference | None) -> Reference | None:
+        """The truth file, or else the vehicle's own attitude over time; with the vehicle's phases of flight."""
+        kept = self.attitudes.get(system, [])
+        reference = truth
+        if reference is None and kept:
+            reference = Reference.from_attitude(kept, f"{kept[0].source} yaw")
+        flags = np.array(self.flags.get(system, []), dtype=bool)
+        if reference is None or flags.all():
             return reference
         times = [r.boot_ns / 1e9 for r in kept]
         return reference.with_flags(times, flags[:, 0], flags[:, 1])
@@ -123,7 +122,7 @@ def replay(
     vehicles = []
     for system in sorted({s for s, _ in keeper.compasses}):
         vehicle = pipeline.vehicles[system]
-        reference = truth or keeper.reference(system)
+        reference = keeper.reference(system, truth)
         compasses = [
             describe(log, vehicle, reference, learn_for_s)
             for (s, _), log in sorted(keeper.compasses.items())
@@ -169,12 +168,15 @@ def scores(
 ) -> Result | None:
     """Heading errors against the reference, on the same samples for all; None where there is none to compare with."""
     declination = np.array(log.declination_rad)
-    if reference is None or not np.isfinite(declination).any():
+    if reference is None:
         return None
+    magnetic = not np.isfinite(declination).any()
+    if magnetic:
+        reference = replace(reference, name=f"{reference.name}, taken as magnetic (declination not known)")
     boot_s = np.array([r.boot_ns for r in log.records]) / 1e9
     started = vehicle.started_ns()
     if learn_for_s is None:
-        got = _live(log, boot_s, reference)
+        got = _live(log, boot_s, reference, magnetic)
     else:
         begin = math.inf if started is None else started / 1e9 + learn_for_s
         crash = math.inf if vehicle.phase.crash_ns is None else vehicle.phase.crash_ns / 1e9
@@ -185,7 +187,8 @@ def scores(
             calibrations["stored"] = Calibration(-stored, matrix)
         window = Window(from_s=begin, crash_s=crash)
         shaped = np.array(log.shaped)
-        got = score_freeze(boot_s, shaped, calibrations, np.nan_to_num(declination), reference, window)
+        measured_s = boot_s - np.array([r.age_s for r in log.records])
+        got = score_freeze(measured_s, shaped, calibrations, np.nan_to_num(declination), reference, window)
     main = got.get("frozen") or got["live"]
     sigma = [math.degrees(r.heading.sigma_rad) for r in log.records if r.heading.valid]
     return {
@@ -203,16 +206,24 @@ def scores(
     }
 
 
-def _live(log: _CompassLog, boot_s: np.ndarray[Any, Any], reference: Reference) -> dict[str, HeadingScore]:
+def _live(
+    log: _CompassLog, boot_s: np.ndarray[Any, Any], reference: Reference, magnetic: bool
+) -> dict[str, HeadingScore]:
     """What would have been published, sample by sample, against what the vehicle streams and the bare sensor."""
-    live = [r.heading.true_rad if r.heading.true_valid else math.nan for r in log.records]
-    stored = [r.stored_heading.true_rad if r.stored_heading.true_valid else math.nan for r in log.records]
+
+    def told(h: Heading) -> float:
+        if magnetic:
+            return h.magnetic_rad if h.valid else math.nan
+        return h.true_rad if h.true_valid else math.nan
+
+    live = [told(r.heading) for r in log.records]
+    stored = [told(r.stored_heading) for r in log.records]
     started = [r.verdict.state is not State.NO_DATA for r in log.records]
     got = score_headings(
         boot_s, {"live": live, "stored": stored}, reference, leave_out={"no data": ~np.array(started)}
     )
     bare = score_freeze(
-        boot_s,
+        boot_s - np.array([r.age_s for r in log.records]),
         np.array(log.shaped),
         {},
         np.nan_to_num(np.array(log.declination_rad)),

@@ -71,7 +71,7 @@ class Wire(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     heading_hz: Annotated[float, _knob("NAMED_VALUE_FLOAT heading", "Hz", "MMAG_HDG_RATE", 0.0, 20.0)] = 2.0
     budget_bps: Annotated[float, _knob("own downlink at most", "B/s", ge=100.0, le=100000.0)] = 500.0
-    imu_hz: Annotated[float, _knob("RAW_IMU, SCALED_IMU2, SCALED_IMU3 asked for", "Hz", ge=0.0, le=100.0)] = 10.0
+    imu_hz: Annotated[float, _knob("RAW_IMU, SCALED_IMU2, SCALED_IMU3 asked for", "Hz", ge=0.0, le=100.0)] = 20.0
     attitude_hz: Annotated[float, _knob("ATTITUDE asked for", "Hz", ge=0.0, le=100.0)] = 20.0
     slow_hz: Annotated[
         float, _knob("position, battery, throttle, time, landed state asked for", "Hz", ge=0.0, le=10.0)

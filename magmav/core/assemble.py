@@ -22,6 +22,8 @@ _AHEAD_NS = 10_000_000_000  # further ahead than any pause worth bridging: a clo
 _NEAR_NS = 5_000_000_000  # a second message this close after the first confirms a new timeline
 _GAP_S = 0.5
 _SOURCE_SILENT_NS = 2_000_000_000
+_REFRESH_S = 0.1  # ArduPilot's refresh; a slower stream only shows it more rarely
+_AVERAGED_S = 0.07
 _PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")
 
 
@@ -70,6 +72,30 @@ class _Compass:
     epoch: int = -1
     turned_rad: float = 0.0  # since the last fresh value
     restart: bool = True
+    refresh_s: float = 0.0  # between fresh values, and between messages
+    period_s: float = 0.0
+
+    def pace(self, boot_ns: int, fresh: bool) -> None:
+        """Learn how often messages come and how often they bring something new."""
+        if fresh:
+            self.refresh_s = _follow(self.refresh_s, (boot_ns - self.fresh_ns) / 1e9)
+        else:
+            self.period_s = _follow(self.period_s, (boot_ns - self.heard_ns) / 1e9)
+
+    @property
+    def age_s(self) -> float:
+        """Age of a fresh value when it comes.
+
+        ArduPilot sends the mean of the last 100 ms (autopilots.md 1.1), then the value waits for the next message.
+        A compass that brings news faster than that is not averaged so, and nothing is known of its delay.
+        """
+        if self.refresh_s < _AVERAGED_S:
+            return 0.0
+        return 0.5 * (_REFRESH_S + min(self.period_s, _REFRESH_S))
+
+
+def _follow(mean_s: float, now_s: float) -> float:
+    return mean_s + 0.1 * (now_s - mean_s) if mean_s and now_s < 4.0 * mean_s else now_s if not mean_s else mean_s
 
 
 class Assembler:
@@ -117,12 +143,17 @@ class Assembler:
             return None
         turning = self.motion.rate_at(reading.boot_ns)
         known.turned_rad += turning * max(reading.boot_ns - known.heard_ns, 0) / 1e9
+        if reading.boot_ns > known.heard_ns:
+            known.pace(reading.boot_ns, fresh=False)
         known.heard_ns = reading.boot_ns
         if known.sent_b_mg is not None and np.array_equal(reading.field_b_mg, known.sent_b_mg):
             self.counts["mag: repeated value"] += 1
             return None
-        state = self.motion.at(reading.boot_ns)
-        if state is None:
+        if known.sent_b_mg is not None:
+            known.pace(reading.boot_ns, fresh=True)
+        age_s = known.age_s
+        state, now = self.motion.at(reading.boot_ns - round(age_s * 1e9)), self.motion.at(reading.boot_ns)
+        if state is None or now is None:
             self.counts["mag: no tilt yet"] += 1
             return None
         dt_s = (reading.boot_ns - known.fresh_ns) / 1e9
@@ -140,6 +171,8 @@ class Assembler:
             roll_rad=state.roll_rad,
             pitch_rad=state.pitch_rad,
             yaw_step_rad=0.0 if gap else state.yaw_rad - known.yaw_rad,
+            lead_rad=now.yaw_rad - state.yaw_rad if now.epoch == state.epoch else 0.0,
+            age_s=age_s,
             gap=gap,
             tilt_from=state.source,
             learn=learn,

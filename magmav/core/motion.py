@@ -7,6 +7,7 @@ steps): the autopilot's yaw follows the compass that is being judged, so its val
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,7 @@ class Motion:
     def __init__(self) -> None:
         self.seen_attitude = False
         self._att: AttitudeReading | None = None
+        self._recent: deque[tuple[AttitudeReading, float]] = deque(maxlen=12)  # with the integrated yaw
         self._yaw_rad = 0.0
         self._epoch = 0
         self._own = _OwnTilt()
@@ -58,7 +60,9 @@ class Motion:
                 self._yaw_rad += wrap_pi(r.yaw_rad - last.yaw_rad)
             else:
                 self._epoch += 2
+                self._recent.clear()
         self._att, self.seen_attitude = r, True
+        self._recent.append((r, self._yaw_rad))
         return True
 
     def inertial(self, r: InertialReading) -> None:
@@ -78,9 +82,14 @@ class Motion:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
         a = self._att
         if a is not None and abs(boot_ns - a.boot_ns) <= _FRESH_NS:
+            yaw = self._yaw_rad
+            for earlier, its_yaw in reversed(self._recent):
+                if abs(earlier.boot_ns - boot_ns) > abs(a.boot_ns - boot_ns):
+                    break
+                a, yaw = earlier, its_yaw
             age = (boot_ns - a.boot_ns) / 1e9
             dr, dp, dy = euler_rates(a.roll_rad, a.pitch_rad, a.rate_b_rads)
-            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, self._yaw_rad + dy * age
+            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, yaw + dy * age
             return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True)
         return self._own.at(boot_ns)
 

@@ -272,8 +272,9 @@ NO_SHAPING = Shaping(IDENTITY3, ZERO3)
 class Sample:
     """One fresh magnetometer value with the motion that belongs to it. Estimators see nothing else.
 
-    mag_b_mg is the sensor's own field, body axes, with all the autopilot's corrections undone.
-    rate_b_rads and the tilt are those at boot_ns. yaw_step_rad is the change of heading since the previous sample of
+    mag_b_mg is the sensor's own field, body axes, with all the autopilot's corrections undone. It was measured age_s
+    before boot_ns (an autopilot sends an average over its refresh interval, some time later): rate_b_rads and the tilt
+    are those of the measurement; lead_rad is how far the heading went on from there to boot_ns. yaw_step_rad is the change of heading since the previous sample of
     this compass, from body rates only. gap is True where that step cannot be trusted (first sample, silence, reboot).
     """
 
@@ -287,6 +288,8 @@ class Sample:
     roll_rad: float
     pitch_rad: float
     yaw_step_rad: float
+    lead_rad: float
+    age_s: float
     gap: bool
     tilt_from: str  # "ATTITUDE" or "OWN"
     learn: bool  # False on time that teaches nothing: on the ground, settling after a parameter change
@@ -359,6 +362,7 @@ class Record:
     compass: int
     device_id: int  # 0 when not known
     boot_ns: int
+    age_s: float  # the field was measured this long before boot_ns
     mag_b_mg: Vec3
     corrected_b_mg: Vec3  # after the estimate
     stored_b_mg: Vec3  # after what the autopilot holds, as it streams it
