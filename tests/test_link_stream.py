@@ -310,6 +310,32 @@ def test_a_device_that_takes_nothing_blocks_nobody(tmp_path: Path) -> None:
         os.close(far)
 
 
+@pytest.mark.parametrize(("waiting", "left"), [([300, 100, 0], 0), ([300] * 1000, 300)])
+def test_closing_waits_for_the_last_words_but_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch, waiting: list[int], left: int
+) -> None:
+    """A stand-in for the device: a pseudo terminal has no slow wire to wait for."""
+    thrown_away = []
+
+    class Radio:
+        def fileno(self) -> int:
+            return 0
+
+        @property
+        def out_waiting(self) -> int:
+            return waiting.pop(0)
+
+        def reset_output_buffer(self) -> None:
+            thrown_away.append(waiting[0] if waiting else 0)
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr("serial.Serial", lambda *_, **__: Radio())
+    began = time.monotonic()
+    serial("/dev/radio").close()
+    assert thrown_away == [left] and time.monotonic() - began < 2.0
+
+
 def test_devices_that_cannot_be_used_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"no device .*nosuch; is it plugged in"):
         serial(str(tmp_path / "nosuch"))

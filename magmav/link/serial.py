@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import termios
+import time
 from contextlib import suppress
 
 import serial as pyserial
 
 from magmav.link import LinkError
 from magmav.link.stream import Port, StreamLink
+
+_LAST_WORDS_MS = 250
 
 
 class SerialPort:
@@ -43,9 +46,16 @@ class SerialPort:
         return os.write(self.fd, data)
 
     def close(self) -> None:
+        """Close, once the last words are out or a quarter of a second has passed.
+
+        Left to itself the kernel may wait half a minute for a radio that takes nothing any more.
+        """
         self.fd = -1
-        # Without this the kernel may wait half a minute for a radio that takes nothing any more.
         with suppress(OSError, termios.error):
+            for _ in range(_LAST_WORDS_MS // 5):
+                if self._serial.out_waiting == 0:
+                    break
+                time.sleep(0.005)
             self._serial.reset_output_buffer()
         with suppress(OSError):
             self._serial.close()
