@@ -10,6 +10,8 @@ from functools import cache
 import numpy as np
 import pytest
 from magmav_sim import SimulatedLink, Simulation, load_scenario
+from magmav_sim.airframe import Airframe, Controls, Home
+from magmav_sim.ground import parked
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_rig import Ground, body_from_ned, mag, simulation
 
@@ -328,9 +330,12 @@ def test_watchdog_reboot_in_flight_keeps_flying_with_a_new_clock():
     assert ground.of("ATTITUDE", 0.2)[0].time_boot_ms < 7000
 
 
-def test_nothing_reaches_standard_output(capfd):
-    sim = simulation(SHORT, top="")
-    sim.advance(7.0)
-    assert sim.truth.height_m > 0
-    del sim
+@pytest.mark.parametrize("model", ["F450", "c172x", "minisgs"])
+def test_airframe_prints_nothing_and_leaves_no_file(model, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    air = Airframe(model, Home(47.4, 8.5, 400.0), parked(0.0, 0.0, 1.0)._replace(height_m=100.0, vn_mps=20.0))
+    states = [air.step(Controls(0.0, 0.0, 0.0, 0.5), (1.0, 0.0, 0.0)) for _ in range(200)]
+    assert states[0].height_m == pytest.approx(100, abs=1) and states[-1].height_m != states[0].height_m
+    del air
     assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []

@@ -91,7 +91,7 @@ def test_stream_cuts_towards_zero():
     assert np.all(ground.field() == 0)
     ground.set("COMPASS_MOTCT", 2)
     for axis, value in (("X", 1.99), ("Y", -2.99), ("Z", 3.4)):
-        per_ampere = (value - field["XYZ".index(axis)]) / sim.autopilot.measured_ampere
+        per_ampere = (value - field["XYZ".index(axis)]) / sim.autopilot.battery.measured_ampere
         ground.set(f"COMPASS_MOT_{axis}", per_ampere)
     for _ in range(20):
         got = ground.field()

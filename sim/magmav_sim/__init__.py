@@ -11,7 +11,8 @@ forward-right-down, earth north-east-down, angles rad. All of it is deterministi
 """
 
 from magmav_sim.link import SimulatedLink
-from magmav_sim.scenario import Scenario, ScenarioError, load_scenario, parse_scenario, scenario_files
+from magmav_sim.scenario import Scenario, ScenarioError
+from magmav_sim.scenario_file import load_scenario, parse_scenario, scenario_files
 from magmav_sim.serve import serve
 from magmav_sim.truth import TruthLog
 from magmav_sim.vehicle import Simulation, Truth

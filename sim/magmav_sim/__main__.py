@@ -13,7 +13,8 @@ from types import FrameType
 
 from magmav.link import Link, LinkError
 from magmav.link.open import open_link
-from magmav_sim.scenario import ScenarioError, load_scenario, scenario_files
+from magmav_sim.scenario import ScenarioError
+from magmav_sim.scenario_file import load_scenario, scenario_files
 from magmav_sim.serve import serve
 from magmav_sim.truth import TruthLog
 from magmav_sim.vehicle import Simulation

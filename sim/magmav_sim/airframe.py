@@ -7,6 +7,7 @@ samples) and never its clock. Its ground is put far below, so that touching down
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -145,6 +146,9 @@ class Airframe:
             fdm.set_debug_level(0)
             if not fdm.load_model(model):
                 raise ValueError(f"airframe: JSBSim has no model {model!r}")
+            # c172x logs to a CSV in the working directory, and disabling that still makes the file.
+            fdm.set_output_filename(0, os.devnull)
+            fdm.disable_output()
             fdm.set_dt(FRAME_S / _STEPS_PER_FRAME)
             lat_deg, lon_deg = home.at(start.north_m, start.east_m)
             for name, value in (

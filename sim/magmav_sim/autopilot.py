@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav_sim.ahrs import READ_S, Ahrs
 from magmav_sim.airframe import FRAME_S, Home, State
+from magmav_sim.battery import Battery
 from magmav_sim.correction import Correction, heading_rad, stored_correction
 from magmav_sim.faults import ArmsAfterSets, DeviceId, NoEffect, Vector
 from magmav_sim.parameters import Parameters, compass_name
@@ -19,9 +19,6 @@ from magmav_sim.world import World
 
 _BLOCK = 4096
 _READ_FRAMES = round(READ_S / FRAME_S)
-_HOVER_AMPERE, _HOVER_LOAD = 17.0, 0.689
-_PLANE_AMPERE = 35.0
-_NO_AMPERE = 0.5
 
 
 class Autopilot:
@@ -56,8 +53,8 @@ class Autopilot:
         self._armed_at_ns, self._disarm_at_ns, self._sets = 0, 0, 0
         self.mode = 0
         self.landed_state = dialect.MAV_LANDED_STATE_ON_GROUND
-        self.throttle = self.ampere = self.measured_ampere = self.used_mah = 0.0
-        self.volt = 16.4
+        self.throttle = 0.0
+        self.battery = Battery(quad=self.quad, seed=seed)
         self.published_mg: list[Vector] = [(0.0, 0.0, 0.0)] * len(world.sensors)
         self._corrections: list[Correction] = []
         self._swapped: set[DeviceId] = set()
@@ -153,8 +150,7 @@ class Autopilot:
         """One frame of truth. ``busy``: a flight is under way, so arming does not time out."""
         self.state, self.elapsed_ns = state, elapsed_ns
         self._frame += 1
-        self.ampere = self._current(state)
-        self._world.sample(state, self.ampere, elapsed_ns / 1e9)
+        self._world.sample(state, self.battery.flow(state.load, self.armed), elapsed_ns / 1e9)
         self.ahrs.step(state)
         if self._frame % _READ_FRAMES == 0:
             self._read()
@@ -163,17 +159,10 @@ class Autopilot:
             if elapsed_ns >= (self._disarm_at_ns or timeout):
                 self.disarm()
 
-    def _current(self, state: State) -> float:
-        if self.quad:
-            return _NO_AMPERE + (0.8 if self.armed else 0.0) + _HOVER_AMPERE * state.load / _HOVER_LOAD
-        return _NO_AMPERE + _PLANE_AMPERE * state.load
-
     def _read(self) -> None:
         """The 10 Hz task: battery monitor and compasses."""
         self.throttle = self.state.throttle
-        self.measured_ampere = max(0.0, self.ampere + 0.2 * self.jitter() / 0.05)
-        self.used_mah += self.ampere * READ_S / 3.6
-        self.volt = 16.4 - 0.015 * self.ampere - 0.0004 * self.used_mah
+        self.battery.read(READ_S)
         self._swap_devices()
         if not self._corrections:
             count = len(self.published_mg)
@@ -183,7 +172,7 @@ class Autopilot:
             self.published_mg[i] = (
                 (0.0, 0.0, 0.0)
                 if raw is None
-                else self._corrections[i].apply(raw, self.throttle, self.measured_ampere)
+                else self._corrections[i].apply(raw, self.throttle, self.battery.measured_ampere)
             )
         if any(self.published_mg[0]):
             magnetic = heading_rad(self.published_mg[0], self.ahrs.roll_rad, self.ahrs.pitch_rad)
@@ -232,10 +221,3 @@ class Autopilot:
         self.events.append(
             {"boot_s": self.boot_ns / 1e9, "elapsed_s": self.elapsed_ns / 1e9, "what": what, **more}
         )
-
-
-def compass_heading_true_rad(autopilot: Autopilot, compass: int) -> float:
-    """Heading of a corrected compass, true north, from the autopilot's own tilt."""
-    field = autopilot.published_mg[compass - 1]
-    magnetic = heading_rad(field, autopilot.roll_rad, autopilot.pitch_rad)
-    return math.remainder(magnetic + autopilot.parameters["COMPASS_DEC"], math.tau)

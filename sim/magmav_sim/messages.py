@@ -109,16 +109,16 @@ def _hud(a: Autopilot) -> Any:
 
 def _battery(a: Autopilot) -> Any:
     return dialect.MAVLink_battery_status_message(
-        0, 0, 1, 32767, [round(a.volt * 1000)] + [65535] * 9, round(a.measured_ampere * 100),
-        round(a.used_mah), -1, max(0, 100 - round(a.used_mah / 52)),
+        0, 0, 1, 32767, [round(a.battery.volt * 1000)] + [65535] * 9, round(a.battery.measured_ampere * 100),
+        round(a.battery.used_mah), -1, max(0, 100 - round(a.battery.used_mah / 52)),
     )  # fmt: skip
 
 
 def _sys_status(a: Autopilot) -> Any:
     seen = 0x2F if any(any(f) for f in a.published_mg) else 0x2B  # bit 2: 3D magnetometer
     return dialect.MAVLink_sys_status_message(
-        0x2F, 0x2F, seen, 230, round(a.volt * 1000), round(a.measured_ampere * 100),
-        max(0, 100 - round(a.used_mah / 52)), 0, 0, 0, 0, 0, 0,
+        0x2F, 0x2F, seen, 230, round(a.battery.volt * 1000), round(a.battery.measured_ampere * 100),
+        max(0, 100 - round(a.battery.used_mah / 52)), 0, 0, 0, 0, 0, 0,
     )  # fmt: skip
 
 

@@ -87,7 +87,7 @@ class Simulation:
             s.pitch_rad,
             s.heading_rad % math.tau,
             s.height_m,
-            self.autopilot.ampere,
+            self.autopilot.battery.ampere,
             self.autopilot.armed,
             tuple(sensor.hard_iron_mg(t_s) for sensor in self.world.sensors),
         )
