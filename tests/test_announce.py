@@ -181,6 +181,30 @@ def test_AT9c_everything_together_stays_at_or_under_500_bytes_a_second() -> None
         assert window <= 10 * 500, f"ten seconds from {start_s} s"
 
 
+def test_headings_go_on_while_a_list_runs() -> None:
+    bench = Bench()
+    entries = [Entry(f"MMAG_P{i}", lambda: 1.25) for i in range(200)]
+    server = ParamServer(entries, Presence(target_system=7), bench.budget)
+    ask = bench.wire.carry(dialect.MAVLink_param_request_list_message(7, 0), 255, 190)
+    server.on_message(ask, "gcs", bench.now_ns)
+    for tick in range(500):
+        bench.now_ns += 20 * MS
+        bench.take(server.poll(bench.now_ns))
+        for compass in (1, 2, 3):
+            bench.announcer.heading(compass, tick % 360, bench.now_ns, bench.now_ns)
+        bench.take(bench.announcer.poll(bench.now_ns))
+    assert len(bench.of("NAMED_VALUE_FLOAT")) >= 57, "2 Hz each, for ten seconds"
+    assert len(bench.of("PARAM_VALUE")) >= 60
+
+
+def test_any_ten_seconds_hold_at_most_ten_times_the_rate_even_after_a_rest() -> None:
+    budget = Budget(500.0)
+    message = dialect.MAVLink_statustext_message(6, b"x" * 50)
+    budget.take(message, 0)
+    sent = sum(budget.size(message) for ms in range(10_000) if budget.take(message, 60 * S + ms * MS))
+    assert 4700 <= sent <= 5000
+
+
 def test_budget_counts_what_the_wire_carries() -> None:
     budget, wire = Budget(), Wire()
     messages = [

@@ -99,8 +99,6 @@ class Announcer:
                 break
             self._texts.popleft()
             self.counts["texts"] += 1
-        if self._texts:
-            return out  # a text is longer than a heading and would never find the bucket full enough
         for compass, held in self._headings.items():
             out += self._send_heading(compass, held, now_ns)
         return out
