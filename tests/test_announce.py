@@ -67,6 +67,8 @@ def test_S12_unknown_or_stale_is_silent_never_frozen() -> None:
     bench.run(2.0, heading=lambda t: 20.0)
     assert [m.value for m in bench.of("NAMED_VALUE_FLOAT")[count:]] == [20.0] * (len(bench.said) - count)
     late = Bench()
+    late.run(2.0, heading=lambda t: 10.0)
+    late.said.clear()
     late.announcer.heading(1, 5.0, S, late.now_ns)
     late.now_ns += 2 * S
     late.take(late.announcer.poll(late.now_ns))
@@ -181,7 +183,7 @@ def test_AT9c_everything_together_stays_at_or_under_500_bytes_a_second() -> None
         assert window <= 10 * 500, f"ten seconds from {start_s} s"
 
 
-def test_headings_go_on_while_a_list_runs() -> None:
+def test_headings_and_texts_go_on_while_a_list_runs() -> None:
     bench = Bench()
     entries = [Entry(f"MMAG_P{i}", lambda: 1.25) for i in range(200)]
     server = ParamServer(entries, Presence(target_system=7), bench.budget)
@@ -192,8 +194,12 @@ def test_headings_go_on_while_a_list_runs() -> None:
         bench.take(server.poll(bench.now_ns))
         for compass in (1, 2, 3):
             bench.announcer.heading(compass, tick % 360, bench.now_ns, bench.now_ns)
+        if tick % 100 == 0:
+            bench.announcer.say(6, f"{tick} is a text of almost fifty bytes, which is a lot", bench.now_ns)
         bench.take(bench.announcer.poll(bench.now_ns))
     assert len(bench.of("NAMED_VALUE_FLOAT")) >= 57, "2 Hz each, for ten seconds"
+    said = "".join(m.text for m in bench.of("STATUSTEXT"))
+    assert said == "".join(f"{t} is a text of almost fifty bytes, which is a lot" for t in range(0, 500, 100))
     assert len(bench.of("PARAM_VALUE")) >= 60
 
 

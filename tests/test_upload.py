@@ -33,9 +33,7 @@ OLD = (f32(5.3), f32(-12.1), f32(40.7))
 def a_change(*step: float, **other: Any) -> Change:
     step = step or (60.0, -45.0, 80.0)
     new = tuple(f32(o + s) for o, s in zip(OLD, step, strict=True))
-    made = Change(
-        1, 1, "COMPASS_DEV_ID", 97539, NAMES, OLD, new, step, (1.0, 1.0, 1.0), tuple(map(abs, step))
-    )
+    made = Change(1, 1, "COMPASS_DEV_ID", 97539, NAMES, OLD, new, step, (1.0, 1.0, 1.0), tuple(map(abs, step)))
     return replace(made, **other)
 
 
@@ -97,9 +95,7 @@ class Rig:
             ]
             last_ns, armed = beats[-1]
             assert not armed, f"{name} was written after a heartbeat that said armed"
-            assert when - last_ns <= 1200 * MS, (
-                f"{name} was written {(when - last_ns) / S} s after a heartbeat"
-            )
+            assert when - last_ns <= 1200 * MS, f"{name} was written {(when - last_ns) / S} s after a heartbeat"
             assert name in NAMES, f"S5, S9: {name} was written"
 
 
@@ -113,9 +109,7 @@ def test_success_is_written_read_back_and_proven() -> None:
     assert rig.journal.ended == [(7, UploadResult.ALL_NEW, ())]
     assert "take-off" in upload.progress  # S20
     last_set = max(t for t, m in rig.vehicle.sent if m.get_type() == "PARAM_SET")
-    read_back = [
-        m.param_id for t, m in rig.vehicle.sent if m.get_type() == "PARAM_REQUEST_READ" and t > last_set
-    ]
+    read_back = [m.param_id for t, m in rig.vehicle.sent if m.get_type() == "PARAM_REQUEST_READ" and t > last_set]
     assert read_back == list(NAMES), "S11: every name is read back"
     rig.check_S1()
 
@@ -185,9 +179,7 @@ def test_S1_armed_at_the_start_is_refused() -> None:
 
 def test_S1_armed_on_any_route_is_refused() -> None:
     rig = Rig()
-    rig.vehicle.at.append(
-        (rig.vehicle.now_ns + S, lambda: rig.vehicle.say(rig.vehicle.heartbeat(True), "udp:2"))
-    )
+    rig.vehicle.at.append((rig.vehicle.now_ns + S, lambda: rig.vehicle.say(rig.vehicle.heartbeat(True), "udp:2")))
     refused(rig, Reason.ARMED, Reason.SECOND_ROUTE)
 
 
@@ -446,9 +438,7 @@ def test_S1_holds_whoever_hears_a_message_first() -> None:
         class First:
             result = None
 
-            def on_message(
-                self, message: Any, route: str, now_ns: int, rig: Rig = rig, up: Upload = upload
-            ) -> Any:
+            def on_message(self, message: Any, route: str, now_ns: int, rig: Rig = rig, up: Upload = upload) -> Any:
                 out = up.on_message(message, route, now_ns)
                 rig.feed(message, route, now_ns)
                 self.result = up.result  # type: ignore[assignment]
@@ -477,6 +467,7 @@ def test_a_write_that_lands_late_is_seen_before_the_retreat_is_believed() -> Non
 
     vehicle.on_set = retreat_begins
     upload = rig.go()
+    vehicle.run(None, 4.0, rig.feed)
     assert upload.result is UploadResult.ALL_OLD
     assert rig.stored() == OLD
 
@@ -657,9 +648,7 @@ def test_window_counts_news_only() -> None:
     assert len(second) == 1
     assert not second.ready(S) and second.ready(2 * S)
     ten = window(*((i, 0, 1) for i in range(10)))
-    assert ten.ready(0) and ten.error_mg == pytest.approx(
-        (np.std(range(10), ddof=1) / 10**0.5, 0.19, 0.19), abs=0.01
-    )
+    assert ten.ready(0) and ten.error_mg == pytest.approx((np.std(range(10), ddof=1) / 10**0.5, 0.19, 0.19), abs=0.01)
 
 
 def test_proof_tells_a_small_shift_from_none() -> None:
