@@ -110,9 +110,9 @@ class MagCompanion:
         if self._states.get(record.compass) is not record.verdict.state:
             self._states[record.compass] = record.verdict.state
             self._say_verdict(record, now_ns)
-        if record.verdict.state is State.READY:
-            if now_ns - self._saved_ns.get(record.compass, -_SAVE_EVERY_NS) >= _SAVE_EVERY_NS:
-                self._save(record.compass, now_ns)
+        saved_ns = self._saved_ns.get(record.compass, -_SAVE_EVERY_NS)
+        if record.verdict.state is State.READY and now_ns - saved_ns >= _SAVE_EVERY_NS:
+            self._save(record.compass, now_ns)
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """What is due from every machine, the write under way first."""
@@ -263,11 +263,10 @@ class MagCompanion:
         self._saved_ns[compass] = now_ns
         if change is None:
             return
-        three = tuple(float(v) for v in record.offsets_mg)
-        sigma = tuple(float(v) for v in record.sigma_mg)
-        saved = SavedEstimate(
-            now_ns + self._unix_offset_ns, str(change.system), change, record.verdict, three, sigma
-        )  # type: ignore[arg-type]
+        x, y, z = (float(v) for v in record.offsets_mg)
+        sx, sy, sz = (float(v) for v in record.sigma_mg)
+        unix_ns = now_ns + self._unix_offset_ns
+        saved = SavedEstimate(unix_ns, str(change.system), change, record.verdict, (x, y, z), (sx, sy, sz))
         try:
             self._store.save_estimate(saved)
         except StoreError as error:

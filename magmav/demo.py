@@ -164,15 +164,16 @@ def demo(
             link.close()
     truth = Reference.from_csv(folder / "truth.csv")
     facts = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
-    result = _result(director, truth, facts) | {"wall_s": round(time.monotonic() - begun, 2), "folder": str(folder)}
+    result = _result(director, truth, facts) | {
+        "wall_s": round(time.monotonic() - begun, 2),
+        "folder": str(folder),
+    }
     if plot is not None:
         _plot(plot, director, truth, facts, result)
     return result
 
 
-def _play(
-    session: Session, director: Director, link: Link, begun: float, progress: Callable[[str], None]
-) -> None:
+def _play(session: Session, director: Director, link: Link, begun: float, progress: Callable[[str], None]) -> None:
     act = None
     for packet in link.packets():
         session.service.turn(packet)

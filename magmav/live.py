@@ -122,9 +122,7 @@ def _shown(change: Change) -> Result:
     return outcome(change, None, (), None) | {"dry_run": True, "messages": dry_run(change)}
 
 
-def outcome(
-    change: Change, result: UploadResult | None, reasons: Sequence[Reason], confirm: int | None
-) -> Result:
+def outcome(change: Change, result: UploadResult | None, reasons: Sequence[Reason], confirm: int | None) -> Result:
     """What a write did, as the JSON that the command prints."""
     code = code_needed(change)
     return {

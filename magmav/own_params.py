@@ -85,12 +85,18 @@ def _offsets(board: Board, clock: Callable[[], int]) -> list[Entry]:
     out = []
     for compass in COMPASSES:
         n = _suffix(compass)
-        for axis, letter in enumerate("XYZ"):
-            out.append(Entry(f"MMAG_OFS{n}_{letter}", show(compass, lambda r, i=axis: float(r.offsets_mg[i]))))  # type: ignore[misc]
-        for axis, letter in enumerate("XYZ"):
-            out.append(Entry(f"MMAG_SD{n}_{letter}", show(compass, lambda r, i=axis: float(r.sigma_mg[i]))))  # type: ignore[misc]
+        for name, pick in (("OFS", _offset), ("SD", _sigma)):
+            out += [Entry(f"MMAG_{name}{n}_{'XYZ'[axis]}", show(compass, pick(axis))) for axis in range(3)]
         out.append(Entry(f"MMAG_STATE{n}", state(compass)))
     return out
+
+
+def _offset(axis: int) -> Callable[[Record], float]:
+    return lambda record: float(record.offsets_mg[axis])
+
+
+def _sigma(axis: int) -> Callable[[Record], float]:
+    return lambda record: float(record.sigma_mg[axis])
 
 
 def _actions(board: Board) -> list[Entry]:

@@ -102,10 +102,12 @@ def replay(
     learn_for_s: float | None = None,
     reference_csv: Path | None = None,
     watchers: Sequence[Watcher] = (),
+    references: dict[int, Reference] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Result:
     """Run a recording to its end; the result is the JSON document that ``magmav replay --json`` prints.
 
+    references : filled with what each system was scored against, for pictures.
     Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
     """
     truth = None if reference_csv is None else Reference.from_csv(reference_csv)
@@ -123,6 +125,8 @@ def replay(
     for system in sorted({s for s, _ in keeper.compasses}):
         vehicle = pipeline.vehicles[system]
         reference = keeper.reference(system, truth)
+        if references is not None and reference is not None:
+            references[system] = reference
         compasses = [
             describe(log, vehicle, reference, learn_for_s)
             for (s, _), log in sorted(keeper.compasses.items())
@@ -132,9 +136,7 @@ def replay(
     return {"source": source, "learn_for_s": learn_for_s, "vehicles": vehicles, "counts": service.counts()}
 
 
-def describe(
-    log: _CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None
-) -> Result:
+def describe(log: _CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None) -> Result:
     """One compass's entry in the result. Numbers that are not known are None."""
     last = log.records[-1]
     compass, known = last.compass, last.estimate.samples > 0
@@ -163,9 +165,7 @@ def describe(
     }
 
 
-def scores(
-    log: _CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None
-) -> Result | None:
+def scores(log: _CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None) -> Result | None:
     """Heading errors against the reference, on the same samples for all; None where there is none to compare with."""
     declination = np.array(log.declination_rad)
     if reference is None:
@@ -219,9 +219,7 @@ def _live(
     live = [told(r.heading) for r in log.records]
     stored = [told(r.stored_heading) for r in log.records]
     started = [r.verdict.state is not State.NO_DATA for r in log.records]
-    got = score_headings(
-        boot_s, {"live": live, "stored": stored}, reference, leave_out={"no data": ~np.array(started)}
-    )
+    got = score_headings(boot_s, {"live": live, "stored": stored}, reference, leave_out={"no data": ~np.array(started)})
     bare = score_freeze(
         boot_s - np.array([r.age_s for r in log.records]),
         np.array(log.shaped),

@@ -218,9 +218,7 @@ def _score(times: Floats, error_rad: Floats, name: str, excluded: dict[str, int]
         reference=name,
         rms_deg=float(np.sqrt(np.mean(error_deg**2))),
         p95_deg=float(np.percentile(np.abs(error_deg), 95.0)),
-        bias_deg=math.degrees(
-            math.atan2(float(np.mean(np.sin(error_rad))), float(np.mean(np.cos(error_rad))))
-        ),
+        bias_deg=math.degrees(math.atan2(float(np.mean(np.sin(error_rad))), float(np.mean(np.cos(error_rad))))),
         n=len(times),
         from_s=float(times.min()),
         to_s=float(times.max()),

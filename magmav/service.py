@@ -47,7 +47,11 @@ class Service:
     """One link, one pipeline, and on a live link one companion."""
 
     def __init__(
-        self, link: Link, pipeline: Pipeline, companion: Companion | None = None, watchers: Sequence[Watcher] = ()
+        self,
+        link: Link,
+        pipeline: Pipeline,
+        companion: Companion | None = None,
+        watchers: Sequence[Watcher] = (),
     ) -> None:
         self.link = link
         self.pipeline = pipeline
@@ -56,7 +60,8 @@ class Service:
         self.codec = Codec(self.decoder.wanted if companion is None else None)
         self.heard: Counter[str] = Counter()
         self.watchers = tuple(watchers)
-        self._now_ns = 0
+        self.now_ns = 0
+        self._route = ""
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Until the link ends or ``stop`` says so. What was borrowed from the vehicle is given back."""
@@ -67,12 +72,15 @@ class Service:
                     break
         finally:
             if self.companion is not None:
-                self._send(self.companion.leave(self._now_ns))
+                self._send(self.companion.leave(self.now_ns))
 
     def turn(self, packet: Packet) -> None:
         """One packet, or one quiet tick."""
-        self._now_ns = packet.t_ns
+        self.now_ns = packet.t_ns
         if packet.data:
+            if not self.link.datagrams and packet.route != self._route:
+                self.codec.forget(self._route)  # the stream was reopened: half a frame of its former life is lost
+                self._route = packet.route
             for message in self.codec.decode(packet.data, packet.route, whole=self.link.datagrams):
                 self._message(message, packet)
         if self.companion is not None:
@@ -98,7 +106,11 @@ class Service:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Everything that was counted on the way, by storey."""
-        out = {"link": dict(self.link.counts), "codec": dict(self.codec.counts), "decode": dict(self.decoder.counts)}
+        out = {
+            "link": dict(self.link.counts),
+            "codec": dict(self.codec.counts),
+            "decode": dict(self.decoder.counts),
+        }
         for system, vehicle in self.pipeline.vehicles.items():
             out[f"vehicle {system}"] = dict(vehicle.assembler.counts + vehicle.counts)
         return {storey: {k: v for k, v in numbers.items() if v} for storey, numbers in out.items()}

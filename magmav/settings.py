@@ -43,9 +43,9 @@ class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     on: Annotated[bool, _knob("learn at all; off: what is known is kept and published", param="MMAG_LEARN")] = True
     estimator: Annotated[str, _knob("kalman, sphere or circle", ge=None)] = "kalman"
     on_ground: Annotated[bool, _knob("learn from a flying vehicle on the ground as well")] = False
-    settle_s: Annotated[
-        float, _knob("not learnt from after a change of compass parameters", "s", ge=0.2, le=10.0)
-    ] = 1.0
+    settle_s: Annotated[float, _knob("not learnt from after a change of compass parameters", "s", ge=0.2, le=10.0)] = (
+        1.0
+    )
 
 
 class Gate(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -59,7 +59,8 @@ class Gate(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ] = 3.0
     residual_mg: Annotated[float, _knob("largest RMS of the fit", "mG", "MMAG_GATE_RES", 5.0, 60.0)] = 30.0
     field_share: Annotated[
-        float, _knob("largest misfit of field strength, as a share of the model's", "", "MMAG_GATE_FLD", 0.02, 0.3)
+        float,
+        _knob("largest misfit of field strength, as a share of the model's", "", "MMAG_GATE_FLD", 0.02, 0.3),
     ] = 0.15
     steady_s: Annotated[float, _knob("the estimate must have stood still this long", "s", ge=2.0, le=60.0)] = 10.0
     change_s: Annotated[float, _knob("wait this long after a sudden change", "s", ge=2.0, le=120.0)] = 15.0
@@ -158,9 +159,7 @@ def checked(settings: Settings, where: str) -> Settings:
     if abs(place.lat_deg) > 90.0 or abs(place.lon_deg) > 180.0:
         raise SettingsError(f"{where}: place: {place.lat_deg}, {place.lon_deg} is not on Earth")
     if settings.learn.estimator not in ("kalman", "sphere", "circle"):
-        raise SettingsError(
-            f"{where}: learn.estimator: {settings.learn.estimator!r}; choose kalman, sphere or circle"
-        )
+        raise SettingsError(f"{where}: learn.estimator: {settings.learn.estimator!r}; choose kalman, sphere or circle")
     return settings
 
 

@@ -220,9 +220,7 @@ class Store:
             if version == 0 and tables:
                 raise StoreError(f"{self.path}: a database of something else, not a magmav store")
             if version > FORMAT:
-                raise StoreError(
-                    f"{self.path}: format {version} is newer than this magmav's {FORMAT}; update magmav"
-                )
+                raise StoreError(f"{self.path}: format {version} is newer than this magmav's {FORMAT}; update magmav")
             db.execute("PRAGMA journal_mode=WAL")
             db.execute("PRAGMA synchronous=FULL")
             if version == 0:
@@ -257,9 +255,7 @@ class Store:
         return out
 
     def _writes(self, where: str, values: tuple[int, ...] = ()) -> list[Write]:
-        sql = (
-            f"SELECT id, unix_ns, vehicle, change, undoes, result, reasons, undone FROM writes WHERE {where}"
-        )
+        sql = f"SELECT id, unix_ns, vehicle, change, undoes, result, reasons, undone FROM writes WHERE {where}"
         return [self._read(_write, row) for row in self._do(lambda db: db.execute(sql, values).fetchall())]
 
     def _read(self, make: Callable[[Sequence[Any]], _T], row: Sequence[Any]) -> _T:

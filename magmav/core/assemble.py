@@ -95,7 +95,10 @@ class _Compass:
 
 
 def _follow(mean_s: float, now_s: float) -> float:
-    return mean_s + 0.1 * (now_s - mean_s) if mean_s and now_s < 4.0 * mean_s else now_s if not mean_s else mean_s
+    """A slow mean that a single silence does not disturb."""
+    if mean_s == 0.0:
+        return now_s
+    return mean_s + 0.1 * (now_s - mean_s) if now_s < 4.0 * mean_s else mean_s
 
 
 class Assembler:
@@ -157,7 +160,7 @@ class Assembler:
             self.counts["mag: no tilt yet"] += 1
             return None
         dt_s = (reading.boot_ns - known.fresh_ns) / 1e9
-        gap = known.restart or dt_s > _GAP_S and not state.bridged or known.epoch != state.epoch
+        gap = known.restart or (dt_s > _GAP_S and not state.bridged) or known.epoch != state.epoch
         if known.sent_b_mg is not None and dt_s > _GAP_S:
             self.counts["mag: gap"] += 1
         sample = Sample(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magmav.core.field import ExpectedField
-from magmav.core.types import AxisState, Estimate, Reason, State, Verdict, Vec3
+from magmav.core.types import AxisState, Estimate, Reason, State, Vec3, Verdict
 
 _WEAK_HORIZONTAL_MG = 100.0
 _EARTH_MG = (150.0, 950.0)

@@ -27,7 +27,12 @@ def magnetic_heading(field_b_mg: NDArray[np.float64], roll_rad: float, pitch_rad
 
 
 def heading_sigma(
-    covariance_b_mg2: Mat3, horizontal_mg: float, down_mg: float, roll_rad: float, pitch_rad: float, tilt_sigma: float
+    covariance_b_mg2: Mat3,
+    horizontal_mg: float,
+    down_mg: float,
+    roll_rad: float,
+    pitch_rad: float,
+    tilt_sigma: float,
 ) -> float:
     """One sigma of the heading, rad, at this tilt, from the hard iron's covariance and the tilt's own sigma (rad).
 

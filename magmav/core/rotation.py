@@ -40,7 +40,8 @@ def body_from_earth(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Mat3:
     """C_bn, (3, 3), from ZYX Euler angles."""
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
     rz = np.array([[cy, sy, 0.0], [-sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return level_from_body(roll_rad, pitch_rad).T @ rz
+    out: Mat3 = level_from_body(roll_rad, pitch_rad).T @ rz
+    return out
 
 
 def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float] | None:

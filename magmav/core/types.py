@@ -204,7 +204,10 @@ class Reason(Enum):
     Z_FROM_MODEL = (11, "down axis rests on the field model, not on motion")
     STILL_MOVING = (12, "estimate still changing more than its sigma")
     JUST_CHANGED = (13, "field changed suddenly a moment ago, learning again")
-    FIELD_NOT_EARTHLIKE = (14, "corrected field strength does not fit the Earth's: magnet or steel near compass")
+    FIELD_NOT_EARTHLIKE = (
+        14,
+        "corrected field strength does not fit the Earth's: magnet or steel near compass",
+    )
     RESIDUAL_TOO_LARGE = (15, "readings scatter too much around the fit")
     HEADING_UNSURE = (16, "heading sigma too large")
     HORIZONTAL_WEAK = (17, "horizontal field under 100 mG: a compass is weak here")
@@ -274,8 +277,9 @@ class Sample:
 
     mag_b_mg is the sensor's own field, body axes, with all the autopilot's corrections undone. It was measured age_s
     before boot_ns (an autopilot sends an average over its refresh interval, some time later): rate_b_rads and the tilt
-    are those of the measurement; lead_rad is how far the heading went on from there to boot_ns. yaw_step_rad is the change of heading since the previous sample of
-    this compass, from body rates only. gap is True where that step cannot be trusted (first sample, silence, reboot).
+    are those of the measurement; lead_rad is how far the heading went on from there to boot_ns. yaw_step_rad is the
+    change of heading since the previous sample of this compass, from body rates only. gap is True where that step
+    cannot be trusted (first sample, silence, reboot).
     """
 
     system: int

@@ -88,9 +88,7 @@ class Codec:
             return False
         tail = 15 if v2 and frame[2] & _SIGNED else 2
         body = len(frame) - tail
-        if crc16.mcrf4xx(frame[1:body] + bytes((kind.crc_extra,))) != int.from_bytes(
-            frame[body : body + 2], "little"
-        ):
+        if crc16.mcrf4xx(frame[1:body] + bytes((kind.crc_extra,))) != int.from_bytes(frame[body : body + 2], "little"):
             self.counts["bad crc"] += 1
             return False
         if self._wanted is not None and number not in self._wanted:

@@ -110,7 +110,10 @@ class Decoder:
         boot_ns = m.time_usec * _US
         out: list[Reading] = []
         if m.fields_updated & 0b111111 == 0b111111:
-            force, rate = vec3((m.xacc, m.yacc, m.zacc), "acceleration"), vec3((m.xgyro, m.ygyro, m.zgyro), "rate")
+            force, rate = (
+                vec3((m.xacc, m.yacc, m.zacc), "acceleration"),
+                vec3((m.xgyro, m.ygyro, m.zgyro), "rate"),
+            )
             out.append(InertialReading(system, "HIGHRES_IMU", boot_ns, force, rate))
         gauss = vec3((m.xmag, m.ymag, m.zmag), "field")
         if m.fields_updated & 0b111000000 != 0b111000000 or not gauss.any():

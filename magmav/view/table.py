@@ -111,6 +111,29 @@ def demo_view(result: Json) -> RenderableType:
     return Group(*parts)
 
 
+def write_view(result: Json) -> RenderableType:
+    """One write or undo, or the dry run of one: the values, every message where asked, and how it ended."""
+    parts: list[RenderableType] = []
+    if result.get("old"):
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for name in ("parameter", "old mG", "new mG", "change mG"):
+            table.add_column(name, justify="left" if name == "parameter" else "right")
+        for name, old in result["old"].items():
+            new = result["new"][name]
+            cells = (name, _number(old, ".1f"), _number(new, ".1f"), _number(new - old, "+.1f"))
+            table.add_row(*(_line(cell) for cell in cells))
+        parts.append(table)
+    if result.get("dry_run"):
+        parts += [_line("Nothing was sent. An upload would send:"), *(_line(f"  {m}") for m in result["messages"])]
+    else:
+        parts.append(_line(_outcome(result.get("result")), "bold"))
+    parts += [_line(f"  {reason.get('text')}") for reason in result.get("reasons") or []]
+    code = result.get("confirm_code")
+    if code is not None and not result.get("confirmed") and result.get("result") in (None, "REFUSED"):
+        parts.append(_line(f"Such a large change wants --confirm-change {code}"))
+    return Group(*parts)
+
+
 def history_view(entries: Iterable[Json]) -> RenderableType:
     """Writes to vehicles, a row each: unix_s, system, compass, device_id, action, result, undone, old, new.
 

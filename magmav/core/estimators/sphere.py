@@ -25,7 +25,7 @@ class SphereEstimator:
         self._fitter = CentredFitter(3)
         self._matrix = np.eye(3)
         self._n = 0
-        # Mean of the down row of R_lb and of the levelled down field: gives the vertical field once the centre is known.
+        # Mean down row of R_lb and mean levelled down field: the vertical field, once the centre is known.
         self._down_row = np.zeros(3)
         self._down_mg = 0.0
 

@@ -14,7 +14,18 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from magmav.core.types import IDENTITY3, NO_SHAPING, ZERO3, Change, Mat3, ParamReading, Shaping, Vec3, mat3, vec3
+from magmav.core.types import (
+    IDENTITY3,
+    NO_SHAPING,
+    ZERO3,
+    Change,
+    Mat3,
+    ParamReading,
+    Shaping,
+    Vec3,
+    mat3,
+    vec3,
+)
 
 COMPASSES = (1, 2, 3)
 _AXES = ("X", "Y", "Z")
@@ -204,7 +215,12 @@ class Calibrations:
 
 
 def plan_change(
-    held: Calibrations, system: int, compass: int, hard_iron_b_mg: Vec3, sigma_mg: Vec3, write: tuple[bool, bool, bool]
+    held: Calibrations,
+    system: int,
+    compass: int,
+    hard_iron_b_mg: Vec3,
+    sigma_mg: Vec3,
+    write: tuple[bool, bool, bool],
 ) -> Change | None:
     """The change of stored offsets that this hard iron asks for, on the axes in ``write`` only.
 
