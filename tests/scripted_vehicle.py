@@ -72,6 +72,7 @@ class Vehicle:
         self.delay_ns = lambda: 5 * MS
         self.duplicate = 0.0
         self.sets: list[tuple[int, str, float]] = []  # as sent by us: when, name, value
+        self.heard_at_set: list[int] = []  # and how many messages we had heard by then
         self.sent: list[tuple[int, Any]] = []  # everything we sent
         self.delivered: list[tuple[int, Any, str]] = []  # what reached us
         self.at: list[tuple[int, Callable[[], None]]] = []
@@ -98,7 +99,12 @@ class Vehicle:
             self.sent.append((self.now_ns, message))
             if message.get_type() == "PARAM_SET":
                 self.sets.append((self.now_ns, message.param_id, message.param_value))
+                self.heard_at_set.append(len(self.delivered))
             self._later("vehicle", message)
+
+    def forget_sets(self) -> None:
+        self.sets.clear()
+        self.heard_at_set.clear()
 
     def _handle(self, message: Any) -> None:
         kind = message.get_type()

@@ -98,8 +98,8 @@ class Upload:
         advice = "reboot or wait half a minute before take-off" if self._sent else ""
         return ": ".join((self.result.name, *filter(None, (why, advice))))
 
-    def start(self, now_ns: int) -> list[Outgoing]:
-        """Begin. What needs no vehicle to be refused is refused here."""
+    def start(self, now_ns: int) -> None:
+        """Begin; messages come out of poll. What needs no vehicle to be refused is refused here."""
         if self.phase is not Phase.IDLE:
             raise ValueError("start: this upload was started before")
         autopilot = self._watch.presence.autopilot
@@ -121,11 +121,10 @@ class Upload:
         self._start_ns = now_ns
         if why:
             self._end(UploadResult.REFUSED, *why)
-            return []
+            return
         tries = self._set.preflight_ns // self._set.retry_ns
         self._ask = Exchange(changes.reads(self.change), self._set.retry_ns, tries)
         self._enter(Phase.PREFLIGHT, now_ns)
-        return self.poll(now_ns)
 
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
         """Learn from one message, then do what is due."""
@@ -290,9 +289,7 @@ class Upload:
         measuring = phase in (Phase.BASELINE, Phase.PROOF)
         self._window = Window(self.change.compass, now_ns) if measuring else None
         if phase is Phase.WRITE:
-            todo = [
-                n for n, v in self._target.items() if n not in self._stored or not same(self._stored[n], v)
-            ]
+            todo = [n for n, v in self._target.items() if n not in self._stored or not same(self._stored[n], v)]
             self._ask = Exchange(todo, self._set.retry_ns, self._set.write_tries)
         elif phase is Phase.READ_BACK:
             self._ask = Exchange(self._target, self._set.retry_ns, self._set.read_tries)
