@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 from magmav.core import gate
@@ -14,6 +15,7 @@ from magmav.core.assemble import Assembler
 from magmav.core.channel import Channel, Circumstances
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.field import ExpectedField, FieldKeeper
+from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
 from magmav.core.types import (
     AttitudeReading,
@@ -26,13 +28,19 @@ from magmav.core.types import (
     ParamReading,
     PositionReading,
     Reading,
+    Reason,
     Record,
+    State,
     ThrottleReading,
     TimeReading,
     VehicleReading,
+    Verdict,
 )
 from magmav.mavlink.autopilot.ardupilot import Calibrations
 from magmav.settings import Settings
+
+_FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
+_SAY_FROZEN_NS = 1_000_000_000
 
 
 class Pipeline:
@@ -77,6 +85,7 @@ class Vehicle:
         self._unix_minus_boot_ns: int | None = None
         self._epochs: dict[int, int] = {}
         self._settle_until_ns: dict[int, int] = {}
+        self._latest: dict[int, Record] = {}
         self._first_ns: int | None = None
         self._reboots = 0
         if not math.isnan(settings.place.lat_deg):
@@ -134,9 +143,9 @@ class Vehicle:
         sample = self.assembler.mag(r, partial(held.undo, compass), shaping, learn)
         self._after_reboot()
         if sample is None:
-            return None
+            return self._frozen(r, t_ns, channel)
         finding = channel.step(sample, r.field_b_mg, self._circumstances(compass, unix_ns))
-        return Record(
+        record = self._latest[compass] = Record(
             t_ns=t_ns,
             system=self.system,
             compass=compass,
@@ -156,6 +165,20 @@ class Vehicle:
             verdict=finding.verdict,
             learnt=sample.learn,
         )
+        return record
+
+    def _frozen(self, r: MagReading, t_ns: int, channel: Channel) -> Record | None:
+        """A stuck sensor gives no fresh value, so nobody would judge it again: withdraw its verdict, once a second."""
+        last = self._latest.get(r.compass)
+        if last is None or r.boot_ns - last.boot_ns < _SAY_FROZEN_NS or self.assembler.frozen_s(r.compass) <= _FROZEN_S:
+            return None
+        if Reason.FROZEN not in last.verdict.reasons:
+            reasons = (Reason.FROZEN, *last.verdict.reasons)
+            channel.verdict = Verdict(State.REFUSED, last.verdict.axes, reasons)
+            self.counts["mag: frozen"] += 1
+        said = replace(last, t_ns=t_ns, boot_ns=r.boot_ns, heading=UNKNOWN, verdict=channel.verdict, learnt=False)
+        self._latest[r.compass] = said
+        return said
 
     # ------------------------------------------------------------ the questions asked on the way
 
@@ -216,6 +239,7 @@ class Vehicle:
         self.phase.kind = kind
         self.calibrations.forget()
         self._settle_until_ns.clear()
+        self._latest.clear()
         self._first_ns = self._unix_minus_boot_ns = None
         for channel in self.channels.values():
             channel.restart()
