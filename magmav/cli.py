@@ -94,6 +94,7 @@ def parser() -> argparse.ArgumentParser:
     restore.add_argument("--dry-run", action="store_true", help="show every message and send none")
 
     history = add("history", "every write to a vehicle, and how it ended", store=True)
+    history.add_argument("--dismiss", type=int, metavar="ID", help="leave a write that was cut short as it is")
     history.add_argument("--limit", type=int, default=20, metavar="N", help="how many (default 20)")
 
     add("settings", "print every setting with its default, unit and limits, as TOML")

@@ -366,6 +366,10 @@ def history(o: argparse.Namespace) -> int:
     rows: list[Result] = []
     if path.exists():
         with Store(path) as store:
+            if o.dismiss is not None:
+                if o.dismiss not in {row.id for row in store.pending()}:
+                    raise Refused(f"{path}: no write {o.dismiss} waits to be undone")
+                store.dismiss(o.dismiss)
             rows = [history_entry(row) for row in store.history(o.limit)]
     _show(o, {"store": str(path), "writes": rows}, lambda result: history_view(result["writes"]))
     return 0

@@ -35,6 +35,7 @@ _STALE_NS = 2_000_000_000
 _SAVE_EVERY_NS = 10_000_000_000
 _RETRY_RESTORE_NS = 30_000_000_000
 _CRITICAL, _WARNING, _INFO = 2, 4, 6
+_NOT_OURS = frozenset({Reason.OFFSETS_CHANGED, Reason.DEVICE_CHANGED, Reason.WRONG_VEHICLE})
 _SLOW = (
     "GLOBAL_POSITION_INT", "GPS_RAW_INT", "BATTERY_STATUS", "VFR_HUD", "SYSTEM_TIME", "EXTENDED_SYS_STATE",
 )  # fmt: skip
@@ -68,14 +69,16 @@ class MagCompanion:
         self._states: dict[int, State] = {}
         self._saved_ns: dict[int, int] = {}
         self._retry_ns = 0
+        self._restoring: int | None = None
+        self._left_alone: set[int] = set()
         v = settings.vehicle
         self.presence = Presence(v.component, v.system or None)
         self._watch = Watch(self.presence)
         self._intervals = Intervals(wanted_rates(settings) if ask else {}, self.presence)
         self._fetch = ParamFetch(wanted_names(COMPASSES), self.presence)
-        budget = Budget(settings.wire.budget_bps)
-        self.announcer = Announcer(budget, settings.wire.heading_hz)
-        self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, budget)
+        self._budget = Budget(settings.wire.budget_bps)
+        self.announcer = Announcer(self._budget, settings.wire.heading_hz)
+        self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, self._budget)
 
     # ------------------------------------------------------------ what the service calls
 
@@ -93,11 +96,11 @@ class MagCompanion:
         self._now_ns = now_ns
         out = self.presence.on_message(message, route, now_ns)
         self._watch.on_message(message, route, now_ns)
-        for machine in (self._intervals, self._fetch, self._server):
+        for machine in (self._intervals, self._fetch):
             out += machine.on_message(message, route, now_ns)
         if self.job is not None:
             out += self.job.on_message(message, route, now_ns)
-        return out
+        return self._counted(out, now_ns) + self._server.on_message(message, route, now_ns)
 
     def on_record(self, record: Record, now_ns: int) -> None:
         """Publish what is new about a compass of the served vehicle."""
@@ -123,8 +126,14 @@ class MagCompanion:
             self._finish(self.job, now_ns)
         elif now_ns >= self._retry_ns:
             self._restore_pending(now_ns)
-        for machine in (self.presence, self._intervals, self._fetch, self._server, self.announcer):
+        for machine in (self.presence, self._intervals, self._fetch):
             out += machine.poll(now_ns)
+        return self._counted(out, now_ns) + self._server.poll(now_ns) + self.announcer.poll(now_ns)
+
+    def _counted(self, out: list[Outgoing], now_ns: int) -> list[Outgoing]:
+        """What must go out at once is paid back by what can wait: the whole stays in the budget (AT-9c)."""
+        for message, _ in out:
+            self._budget.force(message, now_ns)
         return out
 
     def leave(self, now_ns: int) -> list[Outgoing]:
@@ -222,6 +231,12 @@ class MagCompanion:
         if job.result is None:
             return
         self.job, self.ended = None, job
+        if self._restoring is not None and _NOT_OURS.intersection(job.reasons):
+            # Somebody else's values are there now: never overwritten unasked (design, rule 10).
+            self._left_alone.add(self._restoring)
+            text = f"MMAG write {self._restoring} not undone: magmav history"
+            self.announcer.say(_CRITICAL, text, now_ns)
+        self._restoring = None
         code = float(job.result.value)
         if job.result is UploadResult.REFUSED:
             code = -float(job.reasons[0].number) if job.reasons else -1.0
@@ -248,11 +263,13 @@ class MagCompanion:
             return
         self._retry_ns = now_ns + _RETRY_RESTORE_NS
         try:
-            rows = [r for r in self._store.pending() if r.change.system == autopilot.system and r.undoes is None]
+            rows = [r for r in self._store.pending() if r.change.system == autopilot.system]
         except StoreError as error:
             _log.error("%s", error)
             return
+        rows = [r for r in rows if r.id not in self._left_alone]
         if rows:
+            self._restoring = rows[0].id
             self.announcer.say(_WARNING, "MMAG restoring a write that was cut short", now_ns)
             self.start(rows[0].change, None, now_ns, undoes=rows[0].id)
 

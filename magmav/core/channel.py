@@ -14,7 +14,7 @@ from magmav.core.estimators import Estimator
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading, heading_sigma, magnetic_heading
-from magmav.core.rotation import wrap_tau
+from magmav.core.rotation import euler_rates, wrap_tau
 from magmav.core.types import ZERO3, Estimate, Heading, Sample, State, Vec3, Verdict, vec3
 
 _SIGMA_FLOOR_MG = (1.5, 1.5, 5.0)
@@ -103,7 +103,11 @@ class Channel:
             offsets_mg=belief.offsets_mg,
             sigma_mg=belief.sigma_mg,
             corrected_b_mg=corrected,
-            heading=self._now(s, heading(corrected, s.roll_rad, s.pitch_rad, belief.heading_sigma_rad, declination))
+            heading=self._now(
+                s,
+                belief.estimate.delay_s,
+                heading(corrected, s.roll_rad, s.pitch_rad, belief.heading_sigma_rad, declination),
+            )
             if known
             else UNKNOWN,
             stored_heading=heading(sent_b_mg, s.roll_rad, s.pitch_rad, math.pi, declination),
@@ -112,9 +116,10 @@ class Channel:
         )
 
     @staticmethod
-    def _now(s: Sample, h: Heading) -> Heading:
+    def _now(s: Sample, delay_s: float, h: Heading) -> Heading:
         """The heading of the measurement, turned on to the time of the message by the gyro."""
-        magnetic, true = wrap_tau(h.magnetic_rad + s.lead_rad), wrap_tau(h.true_rad + s.lead_rad)
+        lead = s.lead_rad + delay_s * euler_rates(s.roll_rad, s.pitch_rad, s.rate_b_rads)[2]
+        magnetic, true = wrap_tau(h.magnetic_rad + lead), wrap_tau(h.true_rad + lead)
         return replace(h, magnetic_rad=magnetic, true_rad=true)
 
     def _believe(self, s: Sample, c: Circumstances) -> _Belief:

@@ -318,6 +318,7 @@ class Estimate:
     step_nis: float
     samples: int
     changed_ago_s: float  # seconds since the last sudden change was accepted; large when never
+    delay_s: float = 0.0  # of the compass, beyond Sample.age_s, as far as the method can tell
 
 
 @dataclass(frozen=True, slots=True)

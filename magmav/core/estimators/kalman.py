@@ -5,7 +5,8 @@ d a short-lived disturbance in levelled axes (tilt error, motors), first-order G
 
 Process: when the gyro says the heading grew by a, h <- Rz(a) h; the gyro's own error is noise along the horizontal
 circle. b walks slowly. Measurement, with A and e the autopilot's own matrix and motor term:
-    A m + e = A b + R_bl (h + d) + n                                   linear in the state, so no start value is needed.
+    A m + e = A b + Rot(w t) R_bl (h + d) + n            Rot(w t) f: the field f as it was t earlier, at body rate w
+Linear in all but t, and t is small, so no start value is needed and none can be wrong.
 The autopilot's yaw is never a measurement: it follows the compass being judged (estimation.md section 7.1).
 
 All noise is known only up to one common factor, which does not change the gains but scales the covariance; it is
@@ -27,9 +28,10 @@ from magmav.core.rotation import level_from_body
 from magmav.core.types import Estimate, Mat3, Sample, vec3
 
 Array = NDArray[np.float64]
-_B, _H, _D = slice(0, 3), slice(3, 6), slice(6, 9)
-_B_DIAGONAL, _D_DIAGONAL = [0, 10, 20], [60, 70, 80]
-_EYE3, _EYE9 = np.eye(3), np.eye(9)
+_B, _H, _D, _T = slice(0, 3), slice(3, 6), slice(6, 9), 9
+_SIZE = 10
+_B_DIAGONAL, _D_DIAGONAL = [0, 11, 22], [66, 77, 88]
+_EYE3, _EYE = np.eye(3), np.eye(_SIZE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ class Noise:
     sync_s: float = 0.02  # mismatch in time between field and attitude: turns rate into error
     disturbance_mg: float = 8.0  # of the levelled field: a degree of tilt in 500 mG
     disturbance_tau_s: float = 10.0
+    delay_s: float = 0.05  # one sigma of what is not known of the compass's delay
+    delay_walk_s: float = 0.0005  # per square root of a second: a telemetry stream changes its phase
     iron_walk_mg: float = 0.1  # per square root of a second
     gyro_walk_rad: float = math.radians(0.15)  # per square root of a second
     own_gyro_walk_rad: float = math.radians(0.6)  # the same for a gyro nobody has corrected
@@ -61,9 +65,9 @@ class KalmanEstimator:
     def __init__(self, noise: Noise | None = None) -> None:
         self.noise = noise or Noise()
         n = self.noise
-        self._x: Array = np.zeros(9)
+        self._x: Array = np.zeros(_SIZE)
         self._P: Array = np.diag(
-            [n.prior_iron_mg**2] * 3 + [n.prior_field_mg**2] * 3 + [n.disturbance_mg**2] * 3
+            [n.prior_iron_mg**2] * 3 + [n.prior_field_mg**2] * 3 + [n.disturbance_mg**2] * 3 + [n.delay_s**2]
         ).astype(np.float64)
         self._samples = 0
         self._nis_sum = 0.0  # clipped NIS per axis, and how many
@@ -85,13 +89,14 @@ class KalmanEstimator:
         n = self.noise
         dt = max(s.dt_s, 0.0)
         fade = math.exp(-dt / n.disturbance_tau_s)
-        F = _EYE9.copy()
+        F = _EYE.copy()
         F[6, 6] = F[7, 7] = F[8, 8] = fade
         c, si = math.cos(s.yaw_step_rad), math.sin(s.yaw_step_rad)
         F[3:5, 3:5] = ((c, si), (-si, c))
-        Q = np.zeros((9, 9))
+        Q = np.zeros((_SIZE, _SIZE))
         Q.flat[_B_DIAGONAL] = n.iron_walk_mg**2 * dt
         Q.flat[_D_DIAGONAL] = n.disturbance_mg**2 * (1.0 - fade * fade)
+        Q[_T, _T] = n.delay_walk_s**2 * dt
         if s.gap:
             # Nobody knows how far the vehicle turned: the horizontal field may point anywhere.
             self._forget_direction(F)
@@ -119,21 +124,23 @@ class KalmanEstimator:
     def _learn(self, s: Sample) -> None:
         n = self.noise
         body_from_level = level_from_body(s.roll_rad, s.pitch_rad).T
-        H = np.hstack((s.shaping.matrix, body_from_level, body_from_level))
+        level_field = self._x[_H] + self._x[_D]
+        predicted, H = measurement(s, body_from_level, self._x[_B], level_field, float(self._x[_T]))
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
         total = min(max(math.hypot(*self._x[_H]), 200.0), 700.0)
         smear = n.sync_s * math.hypot(*s.rate_b_rads) * total
         R = _EYE3 * (n.reading_mg**2 + smear * smear)
-        innovation = z - H @ self._x
+        innovation = z - predicted
         S = H @ self._P @ H.T + R
         nis = float(innovation @ np.linalg.solve(S, innovation))
         self._judge(nis / 3.0, innovation, s.dt_s)
         limit = n.outlier_nis * self._factor()
         if nis > limit:
             R = R + S * (nis / limit - 1.0)
-        self._x, self._P = update(self._x, self._P, z, R, H)
+        linear = innovation + H @ self._x  # filterpy subtracts H x again
+        self._x, self._P = update(self._x, self._P, linear, R, H)
         self._samples += 1
-        left = z - H @ self._x + body_from_level @ self._x[_D]
+        left = linear - H @ self._x + body_from_level @ self._x[_D]
         self._residual_mg2 += (float(left @ left) / 3.0 - self._residual_mg2) / min(self._samples, 500)
 
     def _judge(self, nis: float, innovation: Array, dt_s: float) -> None:
@@ -178,18 +185,50 @@ class KalmanEstimator:
             residual_mg=math.sqrt(self._residual_mg2),
             step_nis=self._recent_nis,
             samples=self._samples,
+            delay_s=float(self._x[_T]),
             changed_ago_s=self._since_change_s,
         )
 
     def _with_model(self, x: Array, P: Array, expected: ExpectedField) -> tuple[Array, Array]:
         """Two scalar measurements: the downward field and, once its direction is known, the horizontal strength."""
         R = np.array([[self.noise.model_mg**2]])
-        down = np.zeros((1, 9))
+        down = np.zeros((1, _SIZE))
         down[0, 5] = 1.0
         x, P = update(x, P, np.array([expected.down_mg]), R, down)
         strength = math.hypot(x[3], x[4])
         if strength > 0.0 and math.sqrt(P[3, 3] + P[4, 4]) < strength / 3.0:
-            along = np.zeros((1, 9))
+            along = np.zeros((1, _SIZE))
             along[0, 3:5] = x[3:5] / strength
             x, P = update(x, P, np.array([expected.horizontal_mg]), R, along)
         return x, P
+
+
+def measurement(
+    s: Sample, body_from_level: Array, iron_b_mg: Array, field_l_mg: Array, delay_s: float
+) -> tuple[Array, Array]:
+    """Predicted A m + e, (3,) mG, and its Jacobian (3, 10) in (b, h, d, t).
+
+    ``field_l_mg`` is h + d. The body turned by w t since the value was measured, and a fixed field turns the other way.
+    """
+    A = s.shaping.matrix
+    earlier = rotation(s.rate_b_rads * delay_s) @ body_from_level
+    field_b = earlier @ field_l_mg
+    H = np.empty((3, _SIZE))
+    H[:, _B] = A
+    H[:, _H] = H[:, _D] = earlier
+    wx, wy, wz = s.rate_b_rads
+    fx, fy, fz = field_b
+    H[:, _T] = (wy * fz - wz * fy, wz * fx - wx * fz, wx * fy - wy * fx)
+    return A @ iron_b_mg + field_b, H
+
+
+def rotation(turn_rad: Array) -> Array:
+    """Rotation by the vector ``turn_rad`` (3,), (3, 3), Rodrigues' formula; exact to rounding at any size."""
+    x, y, z = turn_rad
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-9:
+        return _EYE3
+    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    out: Array = _EYE3 + first * cross + second * (cross @ cross)
+    return out
