@@ -137,6 +137,9 @@ class Vehicle:
             self._epochs[compass] = held.epoch(compass)
             self.assembler.restart(compass)
             channel.restart()
+        if not held.undoable(compass):
+            self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
+            return None
         channel.held = not self.learning or self._over(r.boot_ns)
         learn = self._teaches(compass, r.boot_ns) and not channel.held
         shaping = held.shaping(compass)

@@ -31,6 +31,8 @@ COMPASSES = (1, 2, 3)
 _AXES = ("X", "Y", "Z")
 _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5
 _BY_THROTTLE, _BY_CURRENT = 1, 2
+_WORST_CONDITION = 100.0
+"""Of a matrix worth undoing: real ones stay under 3, and at 100 the sensor's noise would come back a hundredfold."""
 
 
 def _suffix(compass: int) -> str:
@@ -201,6 +203,11 @@ class Calibrations:
     def shaping(self, compass: int) -> Shaping:
         """Matrix (scale included) and motor term the autopilot applies after its offsets."""
         return self._parts_of(compass)[1]
+
+    def undoable(self, compass: int) -> bool:
+        """False where the stored matrix throws a direction away, as it does while only some of its zeros are heard."""
+        shaping = self._parts_of(compass)[1]
+        return shaping is NO_SHAPING or float(np.linalg.cond(shaping.matrix)) < _WORST_CONDITION
 
     def undo(self, compass: int, sent_b_mg: Vec3) -> Vec3:
         """The sensor's own field, mG, body axes, from the field as sent. ValueError for a singular stored matrix."""
