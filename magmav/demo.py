@@ -35,6 +35,7 @@ from magmav.view.plot_demo import DemoFlight, DemoOffsets, plot_demo
 Result = dict[str, Any]
 _OPERATOR = (255, 190)
 _GIVE_UP_S = 150.0
+_OWN_FILES = ("demo.tlog", "demo.sqlite", "demo.sqlite-wal", "demo.sqlite-shm", "demo.sqlite-writer")
 
 
 class DemoError(Exception):
@@ -152,6 +153,8 @@ def demo(
     """
     begun = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
+    for name in _OWN_FILES:  # of an earlier demonstration; a recording would be appended to
+        (folder / name).unlink(missing_ok=True)
     socket = udp_in("127.0.0.1", 0)
     link = TlogRecorder(socket, folder / "demo.tlog")
     with Store(folder / "demo.sqlite") as store, _vehicle(scenario, socket.port, folder, seed):

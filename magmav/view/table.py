@@ -101,9 +101,13 @@ def demo_view(result: Json) -> RenderableType:
     for number, compass in enumerate(result.get("compasses") or [], start=1):
         error = compass.get("offset_error_mg")
         text = _triple(error, "+.1f") if isinstance(error, Sequence) else _number(error)
-        parts.append(
-            _line(f"Compass {_word(compass.get('compass', number))}: offsets off the truth by {text} mG")
-        )
+        head = f"Compass {_word(compass.get('compass', number))}"
+        parts.append(_line(f"{head}: offsets off the truth by {text} mG"))
+        upload = compass.get("upload") or {}
+        if upload.get("confirm_code") is not None:
+            step, code = _number(upload.get("largest_change_mg"), ".0f"), upload["confirm_code"]
+            given = "given" if upload.get("confirmed") else "not given"
+            parts.append(_line(f"  a change of {step} mG wants the code of its dry run, {code}: {given}", "dim"))
     for name in ("upload", "restore"):
         outcome = (result.get(name) or {}).get("result")
         parts.append(_line(f"{name.capitalize()}: {_outcome(outcome)}"))
