@@ -1,0 +1,40 @@
+"""What the documentation promises is what the code says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import magmav
+from magmav.cli import parser
+from magmav.core.types import Reason
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_every_reason_stands_in_the_verdicts_page_with_its_number_and_sentence() -> None:
+    page = (ROOT / "docs" / "verdicts.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| (.+?) \| .+ \|$", page, flags=re.M)
+    assert rows == [(r.name, str(r.number), r.text) for r in Reason]
+
+
+def test_reason_numbers_are_unique_and_no_reason_is_a_bare_failed() -> None:
+    assert len({r.number for r in Reason}) == len(Reason)
+    assert not [r for r in Reason if "fail" in r.text.lower() or len(r.text.split()) < 3 and r is not Reason.ARMED]
+
+
+def test_the_readme_names_only_commands_and_options_that_exist() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    commands = next(a for a in parser()._actions if a.dest == "command").choices
+    assert commands is not None
+    for line in re.findall(r"^magmav (.+)$", text, flags=re.M):
+        words = line.split("#")[0].split()
+        sub = commands[words[0]]
+        known = {option for action in sub._actions for option in action.option_strings}
+        if words[0] != "sim":
+            assert {w for w in words[1:] if w.startswith("--")} <= known, line
+
+
+def test_everything_the_package_offers_by_name_is_there() -> None:
+    for name in magmav.__all__:
+        assert getattr(magmav, name) is not None
