@@ -141,6 +141,7 @@ def _guarded(options: argparse.Namespace) -> int:
     from magmav.live import NoVehicle
     from magmav.reference import TruthError
     from magmav.replay import NothingToLearnFrom
+    from magmav.saved_result import SavedResultError
     from magmav.store import StoreError
     from magmav.view.records import ViewError
 
@@ -148,7 +149,7 @@ def _guarded(options: argparse.Namespace) -> int:
         result: Any = COMMANDS[options.command](options)
     except (SettingsError, ValueError) as error:
         return fail(USAGE, str(error), options.json)
-    except (NothingToLearnFrom, TruthError, ViewError, ScenarioError, StoreError) as error:
+    except (NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError) as error:
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
         return fail(INPUT if options.command == "replay" else PORT, str(error), options.json)

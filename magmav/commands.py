@@ -19,7 +19,7 @@ import msgspec
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from magmav.core.types import Change, Reading, Reason, Record, vec3
+from magmav.core.types import Change, Reading, Reason, Record
 from magmav.geomag import world_magnetic_model
 from magmav.link import Link, LinkError
 from magmav.settings import Settings, SettingsError, as_toml, checked, load, with_value
@@ -96,6 +96,7 @@ def replay(o: argparse.Namespace) -> int:
     from magmav.replay import replay as run
     from magmav.view.records import RecordWriter
     from magmav.view.table import replay_view
+    from magmav.view.timeline import Timeline
 
     if o.learn_for is not None and not o.learn_for > 0.0:
         raise SettingsError(f"--learn-for: want seconds above 0, got {o.learn_for:g}")
@@ -143,62 +144,6 @@ def replay(o: argparse.Namespace) -> int:
     return 0
 
 
-class Timeline:
-    """What was known every so many seconds of each compass's boot time, with the error against ATTITUDE yaw."""
-
-    def __init__(self, every_s: float) -> None:
-        self._every_ns = every_s * 1e9
-        self._next: dict[tuple[int, int], float] = {}
-        self._yaw: dict[int, float] = {}
-        self.rows: list[Result] = []
-
-    def __call__(self, reading: Reading, record: Record | None) -> None:
-        """Watch one reading."""
-        from magmav.core.types import AttitudeReading
-
-        if isinstance(reading, AttitudeReading):
-            self._yaw[reading.system] = reading.yaw_rad
-        if record is None:
-            return
-        key = (record.system, record.compass)
-        if record.boot_ns < self._next.get(key, -math.inf) - 2 * self._every_ns:
-            self._next[key] = -math.inf  # the vehicle rebooted
-        if record.boot_ns >= self._next.get(key, -math.inf):
-            self._next[key] = record.boot_ns + self._every_ns
-            self.rows.append(self._row(record))
-
-    def _row(self, r: Record) -> Result:
-        known = r.estimate.samples > 0
-        yaw = self._yaw.get(r.system)
-        error = None
-        if yaw is not None and r.heading.true_valid:
-            error = round(math.degrees(math.remainder(r.heading.true_rad - yaw, math.tau)), 2)
-        return {
-            "boot_s": round(r.boot_ns / 1e9, 3),
-            "system": r.system,
-            "compass": r.compass,
-            "offsets_mg": [round(float(v), 1) for v in r.offsets_mg] if known else None,
-            "sigma_mg": [round(float(v), 1) for v in r.sigma_mg] if known else None,
-            "axes": [a.value for a in r.verdict.axes],
-            "state": r.verdict.state.name,
-            "reasons": [x.name for x in r.verdict.reasons],
-            "heading_error_deg": error,
-            "learnt": r.learnt,
-        }
-
-    def lines(self) -> Iterator[str]:
-        """The rows for people."""
-        yield "boot s     compass  offsets x y z mG (+- sigma)                     state     heading error deg"
-        for r in self.rows:
-            if r["offsets_mg"] is None:
-                offsets = "not known"
-            else:
-                pairs = zip(r["offsets_mg"], r["sigma_mg"], strict=True)
-                offsets = "  ".join(f"{o:7.1f} +-{s:5.1f}" for o, s in pairs)
-            error = "not known" if r["heading_error_deg"] is None else f"{r['heading_error_deg']:+.1f}"
-            yield f"{r['boot_s']:9.1f}  {r['compass']:^7}  {offsets:<48}  {r['state']:<9} {error}"
-
-
 def _progress(stack: ExitStack, name: str) -> Callable[[int, int], None] | None:
     """A bar on standard error, where somebody watches."""
     if not sys.stderr.isatty():
@@ -218,9 +163,9 @@ def run(o: argparse.Namespace) -> int:
     from magmav.link.open import open_link
     from magmav.link.recorder import TlogRecorder
     from magmav.live import Session
-    from magmav.reporter import Reporter
     from magmav.store import Store, default_path
     from magmav.view.records import RecordWriter
+    from magmav.view.reporter import Reporter
 
     settings = _settings(o)
     if o.no_requests:
@@ -297,7 +242,12 @@ def _transact(o: argparse.Namespace, pick: Callable[[Any, int, int], Any], confi
 
 def upload(o: argparse.Namespace) -> int:
     """Write what was learnt, with proof."""
-    given = None if o.source is None else from_result(o.source, o.compass)
+    from magmav.saved_result import NotReady, change_from_result
+
+    try:
+        given = None if o.source is None else change_from_result(o.source, o.compass)
+    except NotReady as error:
+        raise Refused(str(error)) from None
 
     def pick(store: Any, system: int, device: int) -> Change | Reason:
         if given is not None:
@@ -322,36 +272,6 @@ def _ended(o: argparse.Namespace, result: Result, good: tuple[str, ...]) -> int:
 
     _show(o, result, write_view)
     return 0 if result.get("dry_run") or result.get("result") in good else 1
-
-
-def from_result(path: Path, compass: int) -> Change:
-    """The change that a saved `magmav replay --json` asks for. SettingsError naming what is missing in the file."""
-    from magmav.mavlink.autopilot.ardupilot import Calibrations, plan_change
-
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LinkError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, UnicodeDecodeError):
-        raise SettingsError(f"{path}: not JSON; save the output of `magmav replay --json` there") from None
-    found = [(v, c) for v in tree.get("vehicles", []) for c in v["compasses"] if c["compass"] == compass]
-    if len(found) != 1:
-        raise SettingsError(f"{path}: want one vehicle with compass {compass}, found {len(found)}")
-    vehicle, entry = found[0]
-    if entry["state"] != "READY" or entry["hard_iron_mg"] is None:
-        why = "; ".join(r["text"] for r in entry["reasons"]) or entry["state"]
-        raise Refused(f"{path}: compass {compass} is not ready to be written: {why}")
-    held = Calibrations()
-    from magmav.core.types import ParamReading
-
-    for name, value in entry["stored"].items():
-        held.param(ParamReading(vehicle["system"], 1, name, float(value), 65535, 0))
-    x, y, z = (axis != "NOT_OBSERVED" for axis in entry["axes"])
-    iron, sigma = vec3(entry["hard_iron_mg"], "hard_iron_mg"), vec3(entry["sigma_mg"], "sigma_mg")
-    change = plan_change(held, vehicle["system"], compass, iron, sigma, (x, y, z))
-    if change is None:
-        raise Refused(f"{path}: stored offsets or device id of compass {compass} are not in it")
-    return change
 
 
 def history(o: argparse.Namespace) -> int:

@@ -26,9 +26,9 @@ from magmav.mavlink.upload import Upload
 from magmav.mavlink.watch import Watch
 from magmav.own_params import COMPASSES, entries
 from magmav.pipeline import Pipeline
-from magmav.pipeline import Vehicle as Flown
 from magmav.settings import Settings, SettingsError, with_value
 from magmav.store import SavedEstimate, Store, StoreError
+from magmav.vehicle import Vehicle as Flown
 
 _log = logging.getLogger("magmav")
 _STALE_NS = 2_000_000_000

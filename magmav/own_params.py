@@ -70,7 +70,7 @@ def _offsets(board: Board, clock: Callable[[], int]) -> list[Entry]:
     def show(compass: int, pick: Callable[[Record], float]) -> Callable[[], float]:
         def get() -> float:
             record = board.record(compass, clock())
-            known = record is not None and record.estimate.samples > 0 and record.device_id != 0
+            known = record is not None and record.estimate.samples > 0 and not record.relative
             return pick(record) if record is not None and known else math.nan
 
         return get

@@ -12,11 +12,12 @@ import numpy as np
 
 from magmav.core.types import AttitudeReading, FieldModel, Heading, Reading, Record, State
 from magmav.link import Link
-from magmav.pipeline import Pipeline, Vehicle
+from magmav.pipeline import Pipeline
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.service import Service, Watcher
 from magmav.settings import Settings
+from magmav.vehicle import Vehicle
 
 Result = dict[str, Any]
 

@@ -63,6 +63,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("stored_heading_true_deg", float, "the same, true, 0 to 360"),
     Column("corrected_norm_mg", float, "strength of the corrected field, mG"),
     Column("learnt", _flag, "true where this sample moved the estimate"),
+    Column("relative", _flag, "stored offsets unknown: the offsets are a change of whatever is stored"),
+    Column("age_s", float, "the field was measured this long before boot_s"),
     Column("reasons", str.split, "codes of the verdict's reasons"),
 )
 
@@ -73,9 +75,7 @@ _JSON_START = '{"t_s": '
 def row(record: Record) -> Row:
     """The record as it is written: times to 1 us, mG and degrees to 1e-4; None where nothing is known."""
     verdict, heading, stored = record.verdict, record.heading, record.stored_heading
-    known = (
-        record.estimate.samples > 0
-    )  # before that the offsets are where the estimator starts, not an answer
+    known = record.estimate.samples > 0  # before that the offsets are where the estimator starts, not an answer
     true = heading.valid and heading.true_valid
     values: list[Value] = [
         round(record.t_ns / 1e9, 6),
@@ -97,6 +97,8 @@ def row(record: Record) -> Row:
         _compass_deg(stored.true_rad, stored.valid and stored.true_valid),
         _number(float(np.linalg.norm(record.corrected_b_mg)), known),
         record.learnt,
+        record.relative,
+        round(record.age_s, 6),
         [reason.name for reason in verdict.reasons],
     ]
     return dict(zip((c.name for c in COLUMNS), values, strict=True))
@@ -140,9 +142,7 @@ class RecordWriter:
         if self._file.closed:
             raise ValueError(f"{self.path}: already closed")
         values = row(record)
-        self._line(
-            ",".join(map(_text, values.values())) if self._csv else json.dumps(values, allow_nan=False)
-        )
+        self._line(",".join(map(_text, values.values())) if self._csv else json.dumps(values, allow_nan=False))
         self.written += 1
 
     def close(self) -> None:
@@ -235,6 +235,4 @@ def _refuse_foreign(path: Path) -> None:
         head = file.read(len(_HEADER))
     start = (_HEADER if _is_csv(path) else _JSON_START).encode()
     if head and not head.startswith(start[: len(head)]):
-        raise ViewError(
-            f"{path}: exists and holds no records of ours, so it is not overwritten; name another file"
-        )
+        raise ViewError(f"{path}: exists and holds no records of ours, so it is not overwritten; name another file")

@@ -43,7 +43,7 @@ class Reporter:
 def line(r: Record) -> dict[str, Any]:
     """One record as a JSON object. What is not known is None."""
     known = r.estimate.samples > 0
-    absolute = known and r.device_id != 0
+    absolute = known and not r.relative
     h = r.heading
     return {
         "boot_s": round(r.boot_ns / 1e9, 3),
@@ -66,7 +66,7 @@ def sentence(r: Record) -> str:
     head = f"compass {r.compass} of system {r.system}: {r.verdict.state.name.lower()}"
     if r.estimate.samples > 0:
         pairs = zip("xyz", r.offsets_mg, r.sigma_mg, strict=True)
-        head += ", offsets " + ", ".join(f"{n} {o:.0f} +- {s:.0f}" for n, o, s in pairs) + " mG"
+        head += (", change of offsets " if r.relative else ", offsets ") + ", ".join(f"{n} {o:.0f} +- {s:.0f}" for n, o, s in pairs) + " mG"
     if r.heading.valid:
         kind, angle = ("true", r.heading.true_rad) if r.heading.true_valid else ("magnetic", r.heading.magnetic_rad)
         head += f", heading {math.degrees(angle):.1f} {kind} +- {math.degrees(r.heading.sigma_rad):.1f} deg"

@@ -1,0 +1,230 @@
+"""One vehicle on a link: what it says of itself, and one channel per compass that learns from it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+
+from magmav.core import gate
+from magmav.core.assemble import Assembler
+from magmav.core.channel import Channel, Circumstances
+from magmav.core.estimators import ESTIMATORS
+from magmav.core.field import ExpectedField, FieldKeeper
+from magmav.core.heading import UNKNOWN
+from magmav.core.phase import Phase
+from magmav.core.types import (
+    AttitudeReading,
+    CurrentReading,
+    FieldModel,
+    InertialReading,
+    LandedReading,
+    MagReading,
+    MotionReading,
+    ParamReading,
+    PositionReading,
+    Reading,
+    Reason,
+    Record,
+    State,
+    ThrottleReading,
+    TimeReading,
+    VehicleReading,
+    Verdict,
+)
+from magmav.mavlink.autopilot.ardupilot import Calibrations
+from magmav.settings import Settings
+
+_FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
+_SAY_FROZEN_NS = 1_000_000_000
+
+
+class Vehicle:
+    """One vehicle: what it says of itself, and one channel per compass."""
+
+    def __init__(self, system: int, settings: Settings, model: FieldModel) -> None:
+        self.system = system
+        self.settings = settings
+        self.autopilot = 0
+        self.learning = settings.learn.on
+        self.learn_for_s: float | None = None
+        self.assembler = Assembler(system)
+        self.phase = Phase()
+        self.calibrations = Calibrations()
+        self.channels: dict[int, Channel] = {}
+        self.counts: Counter[str] = Counter()
+        self._keeper = FieldKeeper(model)
+        self._place: tuple[float, float, float] | None = None
+        self._unix_minus_boot_ns: int | None = None
+        self._epochs: dict[int, int] = {}
+        self._settle_until_ns: dict[int, int] = {}
+        self._latest: dict[int, Record] = {}
+        self._first_ns: int | None = None
+        self._reboots = 0
+        if not math.isnan(settings.place.lat_deg):
+            self._place = (settings.place.lat_deg, settings.place.lon_deg, settings.place.alt_m)
+
+    def apply(self, settings: Settings) -> None:
+        """Take changed settings."""
+        self.settings = settings
+        self.learning = settings.learn.on
+        for channel in self.channels.values():
+            channel.limits = limits(settings)
+
+    def step(self, r: Reading, t_ns: int, unix_ns: int) -> Record | None:
+        """Hand one reading to whom it concerns."""
+        match r:
+            case MagReading():
+                return self._mag(r, t_ns, unix_ns)
+            case AttitudeReading():
+                self.assembler.attitude(r)
+                self.phase.tilt(r.roll_rad, r.pitch_rad, r.boot_ns)
+            case InertialReading():
+                self.assembler.inertial(r)
+            case PositionReading():
+                self._place = (r.lat_deg, r.lon_deg, r.alt_m)
+                self.phase.position(r)
+            case MotionReading():
+                self.phase.moving(r)
+            case VehicleReading():
+                self.autopilot = r.autopilot
+                self.phase.vehicle(r, self._now_ns())
+            case LandedReading():
+                self.phase.landed(r)
+            case ParamReading():
+                for compass in self.calibrations.param(r):
+                    self._settle(compass)
+            case ThrottleReading():
+                self.calibrations.throttle(r.share)
+            case CurrentReading():
+                self.calibrations.current(r.ampere)
+            case TimeReading():
+                self._unix_minus_boot_ns = r.unix_ns - r.boot_ns
+        self._after_reboot()
+        return None
+
+    def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
+        held, compass = self.calibrations, r.compass
+        channel = self._channel(compass)
+        if held.epoch(compass) != self._epochs.get(compass):
+            self._epochs[compass] = held.epoch(compass)
+            self.assembler.restart(compass)
+            channel.restart()
+        if not held.undoable(compass):
+            self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
+            return None
+        channel.held = not self.learning or self._over(r.boot_ns)
+        learn = self._teaches(compass, r.boot_ns) and not channel.held
+        shaping = held.shaping(compass)
+        sample = self.assembler.mag(r, partial(held.undo, compass), shaping, learn)
+        self._after_reboot()
+        if sample is None:
+            return self._frozen(r, t_ns, channel)
+        finding = channel.step(sample, r.field_b_mg, self._circumstances(compass, unix_ns))
+        record = self._latest[compass] = Record(
+            t_ns=t_ns,
+            system=self.system,
+            compass=compass,
+            device_id=held.device_id(compass),
+            boot_ns=r.boot_ns,
+            age_s=sample.age_s,
+            mag_b_mg=sample.mag_b_mg,
+            corrected_b_mg=finding.corrected_b_mg,
+            stored_b_mg=r.field_b_mg,
+            roll_rad=sample.roll_rad,
+            pitch_rad=sample.pitch_rad,
+            estimate=finding.estimate,
+            offsets_mg=finding.offsets_mg,
+            sigma_mg=finding.sigma_mg,
+            heading=finding.heading,
+            stored_heading=finding.stored_heading,
+            verdict=finding.verdict,
+            learnt=sample.learn,
+            relative=not held.known(compass),
+        )
+        return record
+
+    def _frozen(self, r: MagReading, t_ns: int, channel: Channel) -> Record | None:
+        """A stuck sensor gives no fresh value, so nobody would judge it again: withdraw its verdict, once a second."""
+        last = self._latest.get(r.compass)
+        if last is None or r.boot_ns - last.boot_ns < _SAY_FROZEN_NS or self.assembler.frozen_s(r.compass) <= _FROZEN_S:
+            return None
+        if Reason.FROZEN not in last.verdict.reasons:
+            reasons = (Reason.FROZEN, *last.verdict.reasons)
+            channel.verdict = Verdict(State.REFUSED, last.verdict.axes, reasons)
+            self.counts["mag: frozen"] += 1
+        said = replace(last, t_ns=t_ns, boot_ns=r.boot_ns, heading=UNKNOWN, verdict=channel.verdict, learnt=False)
+        self._latest[r.compass] = said
+        return said
+
+    # ------------------------------------------------------------ the questions asked on the way
+
+    def _now_ns(self) -> int:
+        return self.assembler.clock.latest_ns or 0
+
+    def _channel(self, compass: int) -> Channel:
+        if compass not in self.channels:
+            make = ESTIMATORS[self.settings.learn.estimator]
+            self.channels[compass] = Channel(make, limits(self.settings), self.settings.gate.steady_s)
+        return self.channels[compass]
+
+    def _settle(self, compass: int) -> None:
+        until = self._now_ns() + int(self.settings.learn.settle_s * 1e9)
+        self._settle_until_ns[compass] = until
+
+    def _teaches(self, compass: int, boot_ns: int) -> bool:
+        if self._first_ns is None:
+            self._first_ns = boot_ns
+        flying = self.phase.learnable(boot_ns, self.settings.learn.on_ground)
+        return flying and boot_ns >= self._settle_until_ns.get(compass, 0)
+
+    def started_ns(self) -> int | None:
+        """Boot time of take-off, or of the first data where nothing flies; None before."""
+        return self.phase.takeoff_ns if self.phase.flyer else self._first_ns
+
+    def _over(self, boot_ns: int) -> bool:
+        started = self.started_ns()
+        return self.learn_for_s is not None and started is not None and boot_ns - started > self.learn_for_s * 1e9
+
+    def expected(self, unix_ns: int) -> ExpectedField | None:
+        """The Earth's field where the vehicle says it is, or where the settings say; None when neither."""
+        if self._place is None:
+            return None
+        if self._unix_minus_boot_ns is not None:
+            unix_ns = self._unix_minus_boot_ns + self._now_ns()
+        return self._keeper.at(*self._place, unix_ns)
+
+    def _circumstances(self, compass: int, unix_ns: int) -> Circumstances:
+        held = self.calibrations
+        return Circumstances(
+            expected=self.expected(unix_ns),
+            relative=not held.known(compass),
+            assumed=held.assumed(compass),
+            parameters_changed=held.changed(compass),
+            grounded=self.phase.flyer and self.phase.takeoff_ns is None,
+            frozen_s=self.assembler.frozen_s(compass),
+        )
+
+    def _after_reboot(self) -> None:
+        """A vehicle that started anew may hold other parameters and stand elsewhere: begin again."""
+        if self.assembler.reboots == self._reboots:
+            return
+        self._reboots = self.assembler.reboots
+        self.counts["reboots"] += 1
+        kind = self.phase.kind
+        self.phase = Phase()
+        self.phase.kind = kind
+        self.calibrations.forget()
+        self._settle_until_ns.clear()
+        self._latest.clear()
+        self._first_ns = self._unix_minus_boot_ns = None
+        for channel in self.channels.values():
+            channel.restart()
+
+
+def limits(settings: Settings) -> gate.Limits:
+    """The gate's lines, in its own units."""
+    g = settings.gate
+    heading_rad = math.radians(g.heading_sigma_deg)
+    return gate.Limits(g.axis_sigma_mg, heading_rad, g.residual_mg, g.field_share, g.change_s, g.samples)
