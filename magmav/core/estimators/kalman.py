@@ -73,6 +73,7 @@ class KalmanEstimator:
         self._nis_sum = 0.0  # clipped NIS per axis, and how many
         self._recent_nis = 1.0
         self._residual_mg2 = 0.0
+        self._residual_n = 0  # since the last sudden change: what it tore open is no misfit of what came after
         self._bad_s = 0.0
         self._since_change_s = 1e9
         self._innovation_mg = np.zeros(3)
@@ -141,7 +142,8 @@ class KalmanEstimator:
         self._x, self._P = update(self._x, self._P, linear, R, H)
         self._samples += 1
         left = linear - H @ self._x + body_from_level @ self._x[_D]
-        self._residual_mg2 += (float(left @ left) / 3.0 - self._residual_mg2) / min(self._samples, 500)
+        self._residual_n += 1
+        self._residual_mg2 += (float(left @ left) / 3.0 - self._residual_mg2) / min(self._residual_n, 500)
 
     def _judge(self, nis: float, innovation: Array, dt_s: float) -> None:
         """Keep the innovation statistics; accept that the iron has changed when they stay bad."""
@@ -158,6 +160,7 @@ class KalmanEstimator:
             jump = max(80.0, 1.5 * float(np.linalg.norm(self._innovation_mg)))
             self._P[_B, _B] += np.eye(3) * jump**2
             self._bad_s = self._since_change_s = 0.0
+            self._residual_n = 0
 
     def _factor(self) -> float:
         """Variance of unit weight, pulled to 1 while few samples speak."""
