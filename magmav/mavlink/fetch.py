@@ -1,7 +1,8 @@
 """Read the parameters we need by name, a few at a time; never the vehicle's full list (S14).
 
 ArduPilot 4.5 says nothing about a name it does not have, newer ones send PARAM_ERROR. Silence after four
-requests means absent, with one late second chance, since silence may also have been the link.
+requests means absent, with late chances ever further apart, since silence may also have been the link: with 30 %
+loss each way, one name in fifteen gets no answer to four requests, and without its offsets a compass stays unusable.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ _SECOND = 1_000_000_000
 SPACING_NS = _SECOND // 10
 RETRY_NS = _SECOND
 TRIES = 4
-SECOND_CHANCE_NS = 30 * _SECOND
+SECOND_CHANCE_NS = 30 * _SECOND  # then after twice as long, and so on
+LAST_PAUSE_NS = 480 * _SECOND
 
 
 @dataclass(slots=True)
 class _Name:
     heard: bool = False
     absent: bool = False
+    denied: bool = False  # the vehicle itself said that it has no such name
     tries: int = 0
     due_ns: int = 0
 
@@ -75,9 +78,9 @@ class ParamFetch:
         if kind in ("PARAM_VALUE", "PARAM_ERROR") and message.param_id in self._state:
             state = self._state[message.param_id]
             if kind == "PARAM_VALUE":
-                state.heard, state.absent = True, False
+                state.heard, state.absent, state.denied = True, False, False
             elif message.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST and not state.heard:
-                state.absent, state.tries = True, TRIES + 1  # it said so: no second chance needed
+                state.absent = state.denied = True
         return self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[Outgoing]:
@@ -92,13 +95,15 @@ class ParamFetch:
         if now_ns < self._next_ns:
             return []
         for name, state in self._state.items():
-            if state.heard or state.tries > TRIES or now_ns < state.due_ns:
+            if state.heard or state.denied or now_ns < state.due_ns:
                 continue
             if state.tries == TRIES and not state.absent:
                 state.absent, state.due_ns = True, now_ns + SECOND_CHANCE_NS
                 continue
             state.tries += 1
-            state.due_ns = now_ns + RETRY_NS
+            late = state.tries - TRIES
+            pause_ns = RETRY_NS if late <= 0 else min(SECOND_CHANCE_NS << late, LAST_PAUSE_NS)
+            state.due_ns = now_ns + pause_ns
             self._next_ns = now_ns + SPACING_NS
             message = dialect.MAVLink_param_request_read_message(
                 autopilot.system, autopilot.component, name.encode("ascii"), -1
