@@ -52,7 +52,8 @@ def _show(o: argparse.Namespace, result: Result, view: Callable[[Any], Renderabl
     if o.json:
         sys.stdout.write(json.dumps(finite(result)) + "\n")
     else:
-        Console(file=sys.stdout, highlight=False).print(view(result))
+        width = None if sys.stdout.isatty() else 120  # a pipe has no width of its own
+        Console(file=sys.stdout, highlight=False, width=width).print(view(result))
 
 
 def finite(value: Any) -> Any:
@@ -225,7 +226,7 @@ def _transact(o: argparse.Namespace, pick: Callable[[Any, int, int], Any], confi
         link = _live(o.link, open_link)
         stopped = stack.enter_context(_until_signal(link))
         _warn(link)
-        session = Session.on(link, settings, world_magnetic_model, store)
+        session = Session.on(link, settings, world_magnetic_model, store, ask=False)
         console = _console()
         return transact(
             session,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -79,6 +80,11 @@ class MagCompanion:
         self._budget = Budget(settings.wire.budget_bps)
         self.announcer = Announcer(self._budget, settings.wire.heading_hz)
         self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, self._budget)
+
+    def ask_for(self, names: Iterable[str]) -> None:
+        """Ask the vehicle for these messages only; whoever else asked for the others keeps them."""
+        rates = {n: hz for n, hz in wanted_rates(self.settings).items() if n in set(names)}
+        self._intervals = Intervals(rates, self.presence)
 
     # ------------------------------------------------------------ what the service calls
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from magmav.companion import MagCompanion
+from magmav.companion import MagCompanion, wanted_rates
 from magmav.core.types import Change, FieldModel, Reason, UploadResult
 from magmav.link import Link
 from magmav.mavlink.autopilot.ardupilot import offset_names
@@ -19,6 +19,7 @@ from magmav.store import Store, Write
 
 Result = dict[str, Any]
 _SECOND = 1_000_000_000
+_LISTEN_NS = 2_500_000_000
 
 
 class NoVehicle(Exception):
@@ -35,11 +36,18 @@ class Session:
 
     @classmethod
     def on(
-        cls, link: Link, settings: Settings, model: FieldModel, store: Store, watchers: Sequence[Watcher] = ()
+        cls,
+        link: Link,
+        settings: Settings,
+        model: FieldModel,
+        store: Store,
+        watchers: Sequence[Watcher] = (),
+        *,
+        ask: bool = True,
     ) -> Session:
-        """Build pipeline, companion and service for a link."""
+        """Build pipeline, companion and service for a link. ``ask``: request message rates from the start."""
         pipeline = Pipeline(settings, model, link.unix_offset_ns)
-        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns)
+        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns, ask=ask)
         return cls(Service(link, pipeline, companion, watchers), companion, pipeline)
 
 
@@ -61,13 +69,17 @@ def transact(
     """
     companion = session.companion
     begun_ns: int | None = None
-    shown = ""
+    shown, asked = "", False
     chosen: Change | Write | Reason | None = None
     packets = link.packets()
     try:
         for packet in packets:
             session.service.turn(packet)
             begun_ns = packet.t_ns if begun_ns is None else begun_ns
+            if not asked and packet.t_ns - begun_ns > _LISTEN_NS:
+                # Another program may have set the rates; only what does not come anyway is asked for, and returned.
+                asked = True
+                companion.ask_for(n for n in wanted_rates(companion.settings) if not session.service.heard[n])
             if stop():
                 break
             if companion.ended is not None:

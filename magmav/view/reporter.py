@@ -66,7 +66,8 @@ def sentence(r: Record) -> str:
     head = f"compass {r.compass} of system {r.system}: {r.verdict.state.name.lower()}"
     if r.estimate.samples > 0:
         pairs = zip("xyz", r.offsets_mg, r.sigma_mg, strict=True)
-        head += (", change of offsets " if r.relative else ", offsets ") + ", ".join(f"{n} {o:.0f} +- {s:.0f}" for n, o, s in pairs) + " mG"
+        what = "change of offsets" if r.relative else "offsets"
+        head += f", {what} " + ", ".join(f"{n} {o:.0f} +- {s:.0f}" for n, o, s in pairs) + " mG"
     if r.heading.valid:
         kind, angle = ("true", r.heading.true_rad) if r.heading.true_valid else ("magnetic", r.heading.magnetic_rad)
         head += f", heading {math.degrees(angle):.1f} {kind} +- {math.degrees(r.heading.sigma_rad):.1f} deg"
