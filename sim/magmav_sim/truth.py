@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from types import TracebackType
 
-from magmav_sim.vehicle import Simulation
+from magmav_sim.vehicle import Simulation, Truth
 
 _EVERY_NS = 50_000_000
 _COLUMNS = (
@@ -58,37 +58,7 @@ class TruthLog:
         if self._csv.closed:
             return
         self._csv.close()
-        self._json.write_text(json.dumps(self._summary(), indent=1) + "\n", encoding="utf-8")
-
-    def _summary(self) -> dict[str, object]:
-        sim = self._simulation
-        scenario = sim.scenario
-        now = sim.truth
-        return {
-            "scenario": scenario.name,
-            "seed": sim.seed,
-            "date": scenario.date.isoformat(),
-            "place": {k: getattr(scenario.place, k) for k in ("lat_deg", "lon_deg", "alt_m")},
-            "field_ned_mg": list(sim.world.field_ned_mg),
-            "declination_deg": math.degrees(sim.world.declination_rad),
-            "compasses": [
-                {
-                    "compass": n,
-                    "device_id": spec.device_id,
-                    "hard_iron_mg": list(first),
-                    "offsets_mg": [-v for v in first],
-                    "hard_iron_end_mg": list(last),
-                    "soft": [list(row) for row in spec.soft],
-                    "motor_mg_per_a": list(spec.motor_mg_per_a),
-                }
-                for n, (spec, first, last) in enumerate(
-                    zip(scenario.compasses, self._first.hard_iron_b_mg, now.hard_iron_b_mg, strict=True),
-                    start=1,
-                )
-            ],
-            "events": sim.autopilot.events,
-            "elapsed_s": now.elapsed_s,
-        }
+        self._json.write_text(json.dumps(summary(self._simulation, self._first), indent=1) + "\n", encoding="utf-8")
 
     def __enter__(self) -> TruthLog:
         return self
@@ -97,3 +67,34 @@ class TruthLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def summary(sim: Simulation, first: Truth) -> dict[str, object]:
+    """What was flown and what was true: truth.json. ``first`` is the truth at the start."""
+    scenario = sim.scenario
+    now = sim.truth
+    return {
+        "scenario": scenario.name,
+        "seed": sim.seed,
+        "date": scenario.date.isoformat(),
+        "place": {k: getattr(scenario.place, k) for k in ("lat_deg", "lon_deg", "alt_m")},
+        "field_ned_mg": list(sim.world.field_ned_mg),
+        "declination_deg": math.degrees(sim.world.declination_rad),
+        "compasses": [
+            {
+                "compass": n,
+                "device_id": spec.device_id,
+                "hard_iron_mg": list(before),
+                "offsets_mg": [-v for v in before],
+                "hard_iron_end_mg": list(after),
+                "soft": [list(row) for row in spec.soft],
+                "motor_mg_per_a": list(spec.motor_mg_per_a),
+            }
+            for n, (spec, before, after) in enumerate(
+                zip(scenario.compasses, first.hard_iron_b_mg, now.hard_iron_b_mg, strict=True),
+                start=1,
+            )
+        ],
+        "events": sim.autopilot.events,
+        "elapsed_s": now.elapsed_s,
+    }
