@@ -125,6 +125,10 @@ def test_a_singular_matrix_is_named():
     assert not holding(plain() | {"COMPASS_DIA_X": 1e-12}).undoable(1)
     assert not holding(plain() | {"COMPASS_ODI_X": 1.0}).undoable(1)
     assert holding(SHAPED).undoable(1)
+    assert holding(plain(ofs=(1800, -1800, 0))).undoable(1)
+    for mad in ({"COMPASS_OFS_Y": -1e30}, {f"COMPASS_DIA_{a}": 1e30 for a in AXES}, {"COMPASS_DIA_Z": 30.0}):
+        assert not holding(plain() | mad).undoable(1)
+    assert not holding(plain() | {"COMPASS_MOT_X": 1e30, "COMPASS_MOTCT": 1.0}, throttle=0.5).undoable(1)
 
 
 def test_compasses_are_numbered_one_to_three():

@@ -138,6 +138,22 @@ def test_attitude_that_is_not_a_number_is_counted(field, bad):
     assert decoder.counts["ATTITUDE: not a number"] == 1
 
 
+@pytest.mark.parametrize(
+    ("field", "bad"), [("roll", 7.0), ("pitch", -1e30), ("yaw", 6.4), ("rate", 101.0), ("rate", -1e38)]
+)
+def test_attitude_beyond_belief_is_counted(field, bad):
+    decoder = Decoder()
+    assert read(attitude(**{field: bad}), decoder) == []
+    assert decoder.counts["ATTITUDE: beyond belief"] == 1
+    assert len(read(attitude(yaw=6.28, rate=60.0), decoder)) == 1  # some send 0 to 360 degrees
+
+
+def test_highres_imu_beyond_belief_is_counted():
+    decoder = Decoder()
+    assert not any(isinstance(r, MagReading) for r in read(highres((1e30, 0, 0)), decoder))
+    assert decoder.counts["HIGHRES_IMU: beyond belief"] == 1
+
+
 def test_attitude_quaternion_turns_body_to_earth():
     half = math.radians(30.0) / 2
     message = dialect.MAVLink_attitude_quaternion_message(500, math.cos(half), 0, 0, math.sin(half), 0, 0, 0.2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from magmav.core.rotation import euler_from_quaternion
 from magmav.core.types import (
@@ -24,6 +24,7 @@ from magmav.core.types import (
     Reading,
     ThrottleReading,
     TimeReading,
+    Vec3,
     VehicleReading,
     vec3,
 )
@@ -33,6 +34,8 @@ _G = 9.80665
 _MS, _US = 1_000_000, 1_000
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 _EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
+# No gyro measures more than 70 rad/s and no attitude lies beyond a turn; what does is damage, and would poison a filter.
+_MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
 _COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
 
 
@@ -78,7 +81,10 @@ class Decoder:
             return []
         try:
             return how(message, system)
-        except (ValueError, OverflowError):
+        except OverflowError:
+            self.counts[f"{kind}: beyond belief"] += 1
+            return []
+        except ValueError:
             self.counts[f"{kind}: not a number"] += 1
             return []
 
@@ -120,17 +126,17 @@ class Decoder:
             return out
         # Some ArduPilot builds send mG times 1000 and call it gauss: a million times too much (autopilots.md 1.2).
         scale = 1e3 if math.hypot(*gauss) <= 10.0 else 1e-3
-        out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, vec3(gauss * scale, "field")))
+        out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, _within(_MOST_MG, gauss * scale, "field")))
         return out
 
     def _attitude(self, m: Message, system: int) -> list[Reading]:
-        rate = vec3((m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
-        angles = vec3((m.roll, m.pitch, m.yaw), "attitude")
+        rate = _within(_MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        angles = _within(_MOST_RAD, (m.roll, m.pitch, m.yaw), "attitude")
         roll, pitch, yaw = (float(a) for a in angles)
         return [AttitudeReading(system, "ATTITUDE", m.time_boot_ms * _MS, roll, pitch, yaw, rate)]
 
     def _quaternion(self, m: Message, system: int) -> list[Reading]:
-        rate = vec3((m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        rate = _within(_MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
         angles = euler_from_quaternion(m.q1, m.q2, m.q3, m.q4)
         if angles is None:
             self.counts["ATTITUDE_QUATERNION: not a rotation"] += 1
@@ -187,3 +193,11 @@ class Decoder:
             return []
         component = m.get_srcComponent()
         return [ParamReading(system, component, m.param_id, m.param_value, m.param_index, m.param_count)]
+
+
+def _within(most: float, value: Iterable[float], name: str) -> Vec3:
+    """The vector (3,); ValueError when it is not finite, OverflowError when an entry is larger than ``most``."""
+    out = vec3(tuple(value), name)
+    if max(map(abs, out)) > most:
+        raise OverflowError(name)
+    return out

@@ -31,8 +31,9 @@ COMPASSES = (1, 2, 3)
 _AXES = ("X", "Y", "Z")
 _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5
 _BY_THROTTLE, _BY_CURRENT = 1, 2
-_WORST_CONDITION = 100.0
-"""Of a matrix worth undoing: real ones stay under 3, and at 100 the sensor's noise would come back a hundredfold."""
+_MOST_MG = 32767.0  # what RAW_IMU can carry
+_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0
+"""Of a matrix worth undoing, in every direction. Real ones lie between 0.5 and 1.5; at 0.05 noise comes back twentyfold."""
 
 
 def _suffix(compass: int) -> str:
@@ -205,9 +206,13 @@ class Calibrations:
         return self._parts_of(compass)[1]
 
     def undoable(self, compass: int) -> bool:
-        """False where the stored matrix throws a direction away, as it does while only some of its zeros are heard."""
-        shaping = self._parts_of(compass)[1]
-        return shaping is NO_SHAPING or float(np.linalg.cond(shaping.matrix)) < _WORST_CONDITION
+        """False where what is stored throws a direction away, as a matrix does while only some of its zeros are heard,
+        or is larger than the stream could carry."""
+        offset, shaping = self._parts_of(compass)
+        if max(abs(offset).max(), abs(shaping.motor_b_mg).max()) > _MOST_MG:
+            return False
+        values = np.linalg.svd(shaping.matrix, compute_uv=False) if shaping is not NO_SHAPING else (1.0,)
+        return bool(values[0] < _MOST_GAIN and values[-1] > _LEAST_GAIN)
 
     def undo(self, compass: int, sent_b_mg: Vec3) -> Vec3:
         """The sensor's own field, mG, body axes, from the field as sent. ValueError for a singular stored matrix."""
