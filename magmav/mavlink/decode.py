@@ -34,7 +34,7 @@ _G = 9.80665
 _MS, _US = 1_000_000, 1_000
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 _EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
-# No gyro measures more than 70 rad/s and no attitude lies beyond a turn; what does is damage, and would poison a filter.
+# No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
 _MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
 _COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
 

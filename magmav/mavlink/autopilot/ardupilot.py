@@ -33,7 +33,7 @@ _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5
 _BY_THROTTLE, _BY_CURRENT = 1, 2
 _MOST_MG = 32767.0  # what RAW_IMU can carry
 _LEAST_GAIN, _MOST_GAIN = 0.05, 20.0
-"""Of a matrix worth undoing, in every direction. Real ones lie between 0.5 and 1.5; at 0.05 noise comes back twentyfold."""
+"""Of a matrix worth undoing, in every direction. Real ones lie within 0.5 to 1.5; at 0.05 noise grows twentyfold."""
 
 
 def _suffix(compass: int) -> str:
