@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from honest_flight import EXPECTED, MOTIONS, RATE_HZ, samples
 from synthetic_flight import HARD_IRON_MG
+from test_kalman import yaw_only
 
 from magmav.core.channel import Channel, Circumstances
 from magmav.core.estimators import ESTIMATORS
@@ -91,6 +92,28 @@ def test_a_magnet_in_mid_flight(motion):
     again = next(i for i in range(reported, 1200) if found[i].verdict.state is State.READY)
     assert 15 * RATE_HZ - 2 <= again - reported < 40 * RATE_HZ
     assert np.all(np.abs(found[-1].offsets_mg + iron[-1]) < 4.0 * found[-1].sigma_mg)
+
+
+def test_iron_that_keeps_creeping_is_never_ready():
+    """5 mG a second: the estimate follows, and is not written while it moves."""
+    creeping = HARD_IRON_MG + np.arange(900)[:, None] / RATE_HZ * np.array([5.0, -3.0, 0.0])
+    found = run(samples("figure eight", 45, seconds=90.0, iron_mg=creeping))
+    late = [f.verdict for f in found[450:]]
+    assert all(v.state is not State.READY for v in late)
+    assert np.mean([Reason.STILL_MOVING in v.reasons for v in late]) > 0.5
+
+
+def test_level_turns_rest_on_the_field_model_for_the_down_axis():
+    """And say so; without a position the axis stays unknown. Either way the level axes are written."""
+    for where, axis, reason in (
+        (HERE, AxisState.FROM_MODEL, Reason.Z_FROM_MODEL),
+        (NOWHERE, AxisState.NOT_OBSERVED, Reason.Z_NOT_OBSERVED),
+    ):
+        last = run(yaw_only(60.0), where=where)[-1]
+        assert last.verdict.axes == (AxisState.OBSERVED, AxisState.OBSERVED, axis)
+        assert reason in last.verdict.reasons
+        assert last.verdict.state is State.READY
+        assert bool(last.sigma_mg[2] < 10.0) is (where is HERE)
 
 
 def test_held_means_the_answer_stays_while_samples_are_still_judged():

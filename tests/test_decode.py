@@ -188,7 +188,9 @@ def test_no_place_where_there_is_none(lat, lon):
 @pytest.mark.parametrize(("fix", "n"), [(0, 0), (1, 0), (2, 0), (3, 1), (4, 1), (6, 1)])
 def test_gps_counts_from_a_three_dimensional_fix(fix, n):
     message = dialect.MAVLink_gps_raw_int_message(9_000_000, fix, 473977421, 85455934, 488_000, 100, 100, 0, 0, 9)
-    assert len(read(message)) == n
+    places = read(message)
+    assert len(places) == n
+    assert [p.boot_ns for p in places] == [9_000_000_000] * n  # microseconds on this message
 
 
 def test_battery_current():

@@ -79,6 +79,13 @@ def test_turning_is_integrated_from_rates_and_not_from_the_compass(period_ms):
     assert m.at(40_000 * MS).yaw_rad > 3 * math.tau
 
 
+def test_a_turn_that_quickens_is_integrated_at_its_mean():
+    m = Motion()
+    for ms in range(0, 10_001, 200):
+        m.attitude(attitude(ms, rate=(0.0, 0.0, ms / 10_000)))
+    assert m.at(10_000 * MS).yaw_rad == pytest.approx(5.0, abs=1e-9)
+
+
 def test_over_a_slow_stream_the_yaw_step_itself_is_used_across_north():
     m = Motion()
     for i in range(9):
