@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from magmav.core.types import AttitudeReading, FieldModel, Heading, Reading, Record, State
+from magmav.core.types import ZERO3, AttitudeReading, FieldModel, Heading, Reading, Record, State
 from magmav.link import Link
 from magmav.pipeline import Pipeline
 from magmav.reference import Reference
@@ -68,7 +68,7 @@ class Keeper:
     def _record(self, record: Record, vehicle: Vehicle) -> None:
         log = self.compasses.setdefault((record.system, record.compass), _CompassLog())
         shaping = vehicle.calibrations.shaping(record.compass)
-        motor = np.linalg.solve(shaping.matrix, shaping.motor_b_mg)
+        motor = np.linalg.solve(shaping.matrix, shaping.motor_b_mg) if shaping.motor_b_mg.any() else ZERO3
         heading = record.stored_heading
         log.records.append(record)
         log.shaped.append(record.mag_b_mg + motor)

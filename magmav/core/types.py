@@ -8,6 +8,7 @@ Field strength is in milligauss (``_mg``), angles and rates in radians, specific
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum
@@ -25,7 +26,7 @@ Mat3 = NDArray[np.float64]
 def vec3(value: object, name: str) -> Vec3:
     """A finite, read-only float64 array of shape (3,); ValueError naming the culprit otherwise."""
     out = np.array(value, dtype=np.float64)
-    if out.shape != (3,) or not np.isfinite(out).all():
+    if out.shape != (3,) or not all(map(math.isfinite, out.tolist())):  # numpy's isfinite takes thrice as long
         raise ValueError(f"{name}: want 3 finite numbers, got {value!r}")
     out.flags.writeable = False
     return out

@@ -10,7 +10,7 @@ place in the priority order, which is also the order of RAW_IMU, SCALED_IMU2 and
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -83,6 +83,7 @@ class Calibrations:
         self._throttle: float | None = None
         self._ampere: float | None = None
         self._parts: dict[int, tuple[Vec3, Shaping]] = {}
+        self._answers: dict[tuple[str, int], bool] = {}  # asked for every sample, changed by few messages
 
     def param(self, r: ParamReading) -> tuple[int, ...]:
         """Take one parameter; the compasses whose correction it changed."""
@@ -93,7 +94,7 @@ class Calibrations:
         self._held[r.name] = r.value
         if was == r.value:
             return ()
-        self._parts.clear()
+        self._forget_answers()
         changed = tuple(c for c in COMPASSES if self._correction(c) != before[c])
         if r.value not in self._expected.get(r.name, ()):
             for c in changed:
@@ -110,13 +111,27 @@ class Calibrations:
 
     def throttle(self, share: float) -> None:
         """Take the throttle, 0 to 1."""
+        news = self._throttle is None or self._held.get("COMPASS_MOTCT") == _BY_THROTTLE
         self._throttle = share
-        self._parts.clear()
+        if news:
+            self._forget_answers()
 
     def current(self, ampere: float) -> None:
         """Take the battery current."""
+        news = self._ampere is None or self._held.get("COMPASS_MOTCT") == _BY_CURRENT
         self._ampere = ampere
+        if news:
+            self._forget_answers()
+
+    def _forget_answers(self) -> None:
         self._parts.clear()
+        self._answers.clear()
+
+    def _answer(self, question: str, compass: int, find: Callable[[int], bool]) -> bool:
+        known = self._answers.get((question, compass))
+        if known is None:
+            known = self._answers[question, compass] = find(compass)
+        return known
 
     def expect(self, names: Iterable[str], values: Iterable[float]) -> None:
         """These coming values are our own doing: undone exactly, nothing need be learnt again."""
@@ -127,16 +142,22 @@ class Calibrations:
         """The vehicle rebooted: everything must be read again."""
         self._held.clear()
         self._expected.clear()
-        self._parts.clear()
+        self._forget_answers()
         for compass in COMPASSES:
             self._epoch[compass] += 1
 
     def known(self, compass: int) -> bool:
         """True when stored offsets and device id were heard, so that results are absolute."""
+        return self._answer("known", compass, self._is_known)
+
+    def _is_known(self, compass: int) -> bool:
         return all(n in self._held for n in (*offset_names(compass), device_name(compass)))
 
     def assumed(self, compass: int) -> bool:
         """True when scale, matrix or motor terms (or what drives the motor term) are the autopilot's defaults."""
+        return self._answer("assumed", compass, self._is_assumed)
+
+    def _is_assumed(self, compass: int) -> bool:
         names = shaping_names(compass)
         mode = self._held.get("COMPASS_MOTCT")
         if mode == 0.0:
@@ -208,6 +229,9 @@ class Calibrations:
     def undoable(self, compass: int) -> bool:
         """False where what is stored throws a direction away, as a matrix does while only some of its zeros are heard,
         or is larger than the stream could carry."""
+        return self._answer("undoable", compass, self._is_undoable)
+
+    def _is_undoable(self, compass: int) -> bool:
         offset, shaping = self._parts_of(compass)
         if max(abs(offset).max(), abs(shaping.motor_b_mg).max()) > _MOST_MG:
             return False
