@@ -129,11 +129,11 @@ SEEDS = range(40)
 
 @pytest.fixture(scope="module")
 def flights():
-    """(motion, estimate without the model, estimate with one that is 5 mG off) at 40 s."""
+    """(motion, estimate without the model, estimate with one that is 5 mG off) at 30 s."""
     out = []
     for motion in MOTIONS:
         for seed in SEEDS:
-            k = learnt(samples(motion, seed, seconds=40.0))
+            k = learnt(samples(motion, seed, seconds=30.0))
             off = np.random.default_rng(1000 + seed).normal(0.0, 5.0, 2)
             model = replace(EXPECTED, horizontal_mg=EXPECTED.horizontal_mg + off[0], down_mg=EXPECTED.down_mg + off[1])
             out.append((motion, k.estimate(None), k.estimate(model)))
@@ -176,7 +176,7 @@ def test_published_sigmas_hold_for_the_worse_tilt_of_a_real_autopilot():
     errors, sigmas = [], []
     for motion in MOTIONS:
         for seed in range(12):
-            e = learnt(samples(motion, 100 + seed, seconds=40.0, tilt_deg=0.8)).estimate(EXPECTED)
+            e = learnt(samples(motion, 100 + seed, seconds=30.0, tilt_deg=0.8)).estimate(EXPECTED)
             errors.append(e.hard_iron_b_mg - HARD_IRON_MG)
             sigmas.append(floored(e, (1.5, 1.5, 5.0)))
     assert 0.7 < pooled(errors, sigmas) < 1.2
