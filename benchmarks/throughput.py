@@ -128,7 +128,7 @@ def main() -> int:
         ours_rate, bare_rate = messages / ours_s, bare_messages / bare_s
         ratio, each_us = f"{ours_rate / bare_rate:.2f}", f"{1e6 * ours_s / max(samples, 1):.0f}"
         table.add_row(name, f"{messages}", f"{ours_rate:.0f}", f"{bare_rate:.0f}", ratio, f"{samples}", each_us)
-    Console().print(table)
+    Console(width=140).print(table)
     return 0
 
 

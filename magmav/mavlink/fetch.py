@@ -19,7 +19,7 @@ _SECOND = 1_000_000_000
 SPACING_NS = _SECOND // 10
 RETRY_NS = _SECOND
 TRIES = 4
-SECOND_CHANCE_NS = 30 * _SECOND  # then after twice as long, and so on
+LATE_NS = 5 * _SECOND  # after that twice as long, and so on
 LAST_PAUSE_NS = 480 * _SECOND
 
 
@@ -98,11 +98,11 @@ class ParamFetch:
             if state.heard or state.denied or now_ns < state.due_ns:
                 continue
             if state.tries == TRIES and not state.absent:
-                state.absent, state.due_ns = True, now_ns + SECOND_CHANCE_NS
+                state.absent, state.due_ns = True, now_ns + LATE_NS
                 continue
             state.tries += 1
             late = state.tries - TRIES
-            pause_ns = RETRY_NS if late <= 0 else min(SECOND_CHANCE_NS << late, LAST_PAUSE_NS)
+            pause_ns = RETRY_NS if late <= 0 else min(LATE_NS << late, LAST_PAUSE_NS)
             state.due_ns = now_ns + pause_ns
             self._next_ns = now_ns + SPACING_NS
             message = dialect.MAVLink_param_request_read_message(
