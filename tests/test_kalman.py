@@ -173,10 +173,11 @@ def test_published_sigmas_are_floored_and_stay_on_the_safe_side(flights):
 
 
 def test_published_sigmas_hold_for_the_worse_tilt_of_a_real_autopilot():
+    """0.7 degrees, what the heading's sigma reckons with too."""
     errors, sigmas = [], []
     for motion in MOTIONS:
-        for seed in range(12):
-            e = learnt(samples(motion, 100 + seed, seconds=30.0, tilt_deg=0.8)).estimate(EXPECTED)
+        for seed in range(24):
+            e = learnt(samples(motion, 100 + seed, seconds=30.0, tilt_deg=0.7)).estimate(EXPECTED)
             errors.append(e.hard_iron_b_mg - HARD_IRON_MG)
             sigmas.append(floored(e, (1.5, 1.5, 5.0)))
     assert 0.7 < pooled(errors, sigmas) < 1.2
