@@ -83,7 +83,8 @@ class MagCompanion:
 
     def ask_for(self, names: Iterable[str]) -> None:
         """Ask the vehicle for these messages only; whoever else asked for the others keeps them."""
-        rates = {n: hz for n, hz in wanted_rates(self.settings).items() if n in set(names)}
+        chosen = set(names)
+        rates = {n: hz for n, hz in wanted_rates(self.settings).items() if n in chosen}
         self._intervals = Intervals(rates, self.presence)
 
     # ------------------------------------------------------------ what the service calls

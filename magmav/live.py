@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from magmav.store import Store, Write
 
 Result = dict[str, Any]
 _SECOND = 1_000_000_000
-_LISTEN_NS = 2_500_000_000
+_SETTLE_NS, _LISTEN_NS = 1_200_000_000, 2_700_000_000
 
 
 class NoVehicle(Exception):
@@ -70,16 +71,19 @@ def transact(
     companion = session.companion
     begun_ns: int | None = None
     shown, asked = "", False
+    before: Counter[str] | None = None
     chosen: Change | Write | Reason | None = None
     packets = link.packets()
     try:
         for packet in packets:
             session.service.turn(packet)
             begun_ns = packet.t_ns if begun_ns is None else begun_ns
-            if not asked and packet.t_ns - begun_ns > _LISTEN_NS:
+            if before is None and packet.t_ns - begun_ns > _SETTLE_NS:
+                before = session.service.heard.copy()  # what an earlier command had asked for may still have run out
+            elif not asked and before is not None and packet.t_ns - begun_ns > _LISTEN_NS:
                 # Another program may have set the rates; only what does not come anyway is asked for, and returned.
-                asked = True
-                companion.ask_for(n for n in wanted_rates(companion.settings) if not session.service.heard[n])
+                asked, heard = True, session.service.heard - before
+                companion.ask_for([n for n in wanted_rates(companion.settings) if not heard[n]])
             if stop():
                 break
             if companion.ended is not None:
