@@ -20,8 +20,8 @@ from typing import Any
 __version__ = "0.1.0"
 
 _WHERE = {
-    "replay": "magmav.replay",
-    "NothingToLearnFrom": "magmav.replay",
+    "replay": "magmav.recording",
+    "NothingToLearnFrom": "magmav.recording",
     "open_recording": "magmav.link.tlog",
     "Settings": "magmav.settings",
     "load_settings": "magmav.settings",

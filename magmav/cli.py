@@ -139,8 +139,8 @@ def _guarded(options: argparse.Namespace) -> int:
 
     from magmav.demo import DemoError
     from magmav.live import NoVehicle
+    from magmav.recording import NothingToLearnFrom
     from magmav.reference import TruthError
-    from magmav.replay import NothingToLearnFrom
     from magmav.saved_result import SavedResultError
     from magmav.store import StoreError
     from magmav.view.records import ViewError

@@ -94,7 +94,7 @@ def _until_signal(link: Link) -> Iterator[Callable[[], bool]]:
 def replay(o: argparse.Namespace) -> int:
     """A recording through the pipeline."""
     from magmav.link.tlog import TlogLink
-    from magmav.replay import replay as run
+    from magmav.recording import replay as run
     from magmav.view.records import RecordWriter
     from magmav.view.table import replay_view
     from magmav.view.timeline import Timeline

@@ -8,6 +8,7 @@ Live, replay and simulation run this and nothing else. It has no clock and no li
 
 from __future__ import annotations
 
+from magmav.core.estimators import ESTIMATORS
 from magmav.core.types import FieldModel, Reading, Record
 from magmav.settings import Settings
 from magmav.vehicle import Vehicle
@@ -21,6 +22,7 @@ class Pipeline:
         self._model = model
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
+        ESTIMATORS[settings.learn.estimator]()  # its libraries take seconds to load: now, not at the first sample
 
     def apply(self, settings: Settings) -> None:
         """Settings changed in flight: what is learnt stays."""

@@ -7,15 +7,19 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from magmav.core import gate
 from magmav.core.assemble import Assembler
-from magmav.core.channel import Channel, Circumstances
+from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
 from magmav.core.types import (
+    ZERO3,
     AttitudeReading,
+    AxisState,
     CurrentReading,
     FieldModel,
     InertialReading,
@@ -30,8 +34,10 @@ from magmav.core.types import (
     State,
     ThrottleReading,
     TimeReading,
+    Vec3,
     VehicleReading,
     Verdict,
+    vec3,
 )
 from magmav.mavlink.autopilot.ardupilot import Calibrations
 from magmav.settings import Settings
@@ -135,7 +141,7 @@ class Vehicle:
             roll_rad=sample.roll_rad,
             pitch_rad=sample.pitch_rad,
             estimate=finding.estimate,
-            offsets_mg=finding.offsets_mg,
+            offsets_mg=self._to_store(compass, finding),
             sigma_mg=finding.sigma_mg,
             heading=finding.heading,
             stored_heading=finding.stored_heading,
@@ -144,6 +150,12 @@ class Vehicle:
             relative=not held.known(compass),
         )
         return record
+
+    def _to_store(self, compass: int, finding: Finding) -> Vec3:
+        """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4)."""
+        stored = self.calibrations.offsets(compass)
+        unknown = [axis is AxisState.NOT_OBSERVED for axis in finding.verdict.axes]
+        return vec3(np.where(unknown, ZERO3 if stored is None else stored, finding.offsets_mg), "offsets")
 
     def _frozen(self, r: MagReading, t_ns: int, channel: Channel) -> Record | None:
         """A stuck sensor gives no fresh value, so nobody would judge it again: withdraw its verdict, once a second."""

@@ -27,9 +27,7 @@ def simulation(
     body: str = COMPASS, top: str = "stay = true", seed: int | None = None, airframe: str = "F450"
 ) -> Simulation:
     """Standing on the ground for ever, unless the words say otherwise."""
-    return Simulation(
-        parse_scenario((HEAD.replace("F450", airframe) + top + "\n" + body).encode(), "bench.toml"), seed
-    )
+    return Simulation(parse_scenario((HEAD.replace("F450", airframe) + top + "\n" + body).encode(), "bench.toml"), seed)
 
 
 def iron_free(parameters: str = "", rest: str = "") -> Simulation:

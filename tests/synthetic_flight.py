@@ -39,9 +39,7 @@ def fly(
     yaw = 9.0 * np.sin(2 * np.pi * t / 60.0) + 0.4
     roll = np.radians(35.0) * np.cos(2 * np.pi * t / 60.0) + np.radians(3.0) * np.sin(1.3 * t)
     pitch = np.radians(5.0) * np.sin(0.7 * t) + np.radians(3.0)
-    true = np.array(
-        [turn(0, r) @ turn(1, p) @ turn(2, y) @ EARTH_MG for r, p, y in zip(roll, pitch, yaw, strict=True)]
-    )
+    true = np.array([turn(0, r) @ turn(1, p) @ turn(2, y) @ EARTH_MG for r, p, y in zip(roll, pitch, yaw, strict=True)])
     matrix = SOFT_IRON if soft else np.eye(3)
     noise = np.random.default_rng(seed).normal(0.0, noise_mg, true.shape) if noise_mg else 0.0
     sensor = true @ np.linalg.inv(matrix).T + HARD_IRON_MG + noise

@@ -20,7 +20,7 @@ def test_every_reason_stands_in_the_verdicts_page_with_its_number_and_sentence()
 
 def test_reason_numbers_are_unique_and_no_reason_is_a_bare_failed() -> None:
     assert len({r.number for r in Reason}) == len(Reason)
-    assert not [r for r in Reason if "fail" in r.text.lower() or len(r.text.split()) < 3 and r is not Reason.ARMED]
+    assert not [r for r in Reason if "fail" in r.text.lower() or (len(r.text.split()) < 3 and r is not Reason.ARMED)]
 
 
 def test_the_readme_names_only_commands_and_options_that_exist() -> None:

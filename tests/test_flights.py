@@ -16,7 +16,7 @@ from magmav.cli import main
 from magmav.commands import finite
 from magmav.geomag import world_magnetic_model
 from magmav.link.tlog import TlogLink
-from magmav.replay import replay
+from magmav.recording import replay
 from magmav.settings import Settings
 
 _DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared" / "data"))

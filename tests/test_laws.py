@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from memory_flight import HZ, STORED, Bench, Teller, flight
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from synthetic_flight import HARD_IRON_MG
+from synthetic_flight import EARTH_MG, HARD_IRON_MG
 from test_pipeline import bits
 
-from magmav.core.types import State
+from magmav.core.types import AxisState, State
 from magmav.settings import Settings, with_value
 
 FLIGHT = flight(seconds=16.0)
@@ -103,10 +103,41 @@ def test_sigma_never_lies_under_its_floor_and_every_number_is_finite():
             assert 0.0 <= record.heading.sigma_rad < math.radians(45.0)
 
 
-def test_sums_fit_offsets_are_minus_the_iron_and_the_correction_uses_them():
+def test_sums_fit_known_axes_store_minus_the_iron_and_the_correction_uses_the_iron():
+    known = 0
     for record in Bench().play(FLIGHT)[60:]:
-        assert record.offsets_mg == pytest.approx(-record.estimate.hard_iron_b_mg)
-        assert record.corrected_b_mg == pytest.approx(record.mag_b_mg + record.offsets_mg, abs=1e-9)
+        iron = record.estimate.hard_iron_b_mg
+        for axis, state in enumerate(record.verdict.axes):
+            seen = state is not AxisState.NOT_OBSERVED
+            known += seen
+            assert record.offsets_mg[axis] == pytest.approx(-iron[axis] if seen else 0.0)
+        assert record.corrected_b_mg == pytest.approx(record.mag_b_mg - iron, abs=1e-9)
+    assert known > 100
+
+
+def rover(offsets_mg, told):
+    """A rover on flat ground turning on the spot for 40 s: no tilt at all, and nobody tells where it is."""
+    tell, r = Teller(1), np.random.default_rng(0)
+    out = [(10_000, tell.heartbeat(kind=10) + tell.params(told))]
+    for i in range(40 * HZ):
+        ms, yaw = 10_000 + i * 1000 // HZ, 0.4 * i / HZ
+        north, east, down = EARTH_MG
+        field = (north * math.cos(yaw) + east * math.sin(yaw), east * math.cos(yaw) - north * math.sin(yaw), down)
+        sent = np.trunc(np.array(field) + HARD_IRON_MG + r.normal(0.0, 3.0, 3) + offsets_mg)
+        out += [(ms, tell.attitude(ms, 0.0, 0.0, yaw, np.array([0.0, 0.0, 0.4]))), (ms, tell.imu(ms, sent))]
+    return out
+
+
+def test_S4_an_axis_that_was_not_observed_keeps_its_stored_offset_bit_for_bit():
+    """Level turns and no position: nothing tells the down axis of the sensor from the field's own down part."""
+    stored = np.array([12.0, -34.0, 56.789])
+    told = {n: v for n, v in STORED.items() if not n.startswith("COMPASS_OFS_")}
+    told |= {f"COMPASS_OFS_{a}": float(np.float32(v)) for a, v in zip("XYZ", stored, strict=True)}
+    records = Bench().play(rover(stored, told))
+    last = records[-1]
+    assert last.verdict.axes[2] is AxisState.NOT_OBSERVED and last.sigma_mg[2] > 100.0
+    assert all(r.offsets_mg[2] == float(np.float32(stored[2])) for r in records)
+    assert last.verdict.axes[0] is not AxisState.NOT_OBSERVED and last.offsets_mg[0] != stored[0]
 
 
 @pytest.mark.parametrize("estimator", ["kalman", "sphere", "circle"])

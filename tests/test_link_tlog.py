@@ -139,9 +139,7 @@ def test_a_file_cut_in_its_last_record_gives_all_the_others(tmp_path: Path, left
     assert link.counts["truncated"] == 1 and link.counts["garbage bytes"] == 0
 
 
-@pytest.mark.parametrize(
-    "garbage", [b"x", b"\x00" * 5000, bytes(range(256)) * 3, b"\xfd" * 700, b"\xa3\x95\x80"]
-)
+@pytest.mark.parametrize("garbage", [b"x", b"\x00" * 5000, bytes(range(256)) * 3, b"\xfd" * 700, b"\xa3\x95\x80"])
 def test_garbage_between_records_costs_no_record(tmp_path: Path, garbage: bytes) -> None:
     records = flight(20)
     packets, link = read(written(tmp_path / "a.tlog", *records[:10], garbage, *records[10:]))
@@ -232,9 +230,7 @@ quick = settings(max_examples=200, deadline=None, suppress_health_check=[HealthC
 
 @quick
 @given(at=st.integers(0, len(WHOLE) - 1), mask=st.integers(1, 255))
-def test_any_byte_flipped_costs_its_record_and_at_most_a_neighbour(
-    tmp_path: Path, at: int, mask: int
-) -> None:
+def test_any_byte_flipped_costs_its_record_and_at_most_a_neighbour(tmp_path: Path, at: int, mask: int) -> None:
     hurt = bytearray(WHOLE)
     hurt[at] ^= mask
     packets, _ = read(written(tmp_path / "a.tlog", bytes(hurt)))
@@ -247,11 +243,7 @@ def test_any_byte_flipped_costs_its_record_and_at_most_a_neighbour(
 
 
 @quick
-@given(
-    pieces=st.lists(
-        st.tuples(st.integers(0, len(WHOLE)), st.integers(0, 400), st.binary(max_size=80)), max_size=4
-    )
-)
+@given(pieces=st.lists(st.tuples(st.integers(0, len(WHOLE)), st.integers(0, 400), st.binary(max_size=80)), max_size=4))
 def test_anything_cut_out_or_put_in_spares_what_is_far_from_it(
     tmp_path: Path, pieces: list[tuple[int, int, bytes]]
 ) -> None:
@@ -273,9 +265,7 @@ def test_anything_cut_out_or_put_in_spares_what_is_far_from_it(
 
 
 @quick
-@given(
-    at=st.integers(0, len(WHOLE) - 1), mask=st.integers(0, 255), size=st.integers(40, 4000), new=st.binary()
-)
+@given(at=st.integers(0, len(WHOLE) - 1), mask=st.integers(0, 255), size=st.integers(40, 4000), new=st.binary())
 def test_the_pieces_a_file_is_read_in_change_nothing(at: int, mask: int, size: int, new: bytes) -> None:
     hurt = bytearray(WHOLE)
     hurt[at] ^= mask

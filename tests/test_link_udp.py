@@ -53,9 +53,7 @@ def test_one_datagram_is_one_packet_and_each_peer_has_its_route(peers: list[sock
             sock.sendto(b"second %d" % i, ("127.0.0.1", link.port))
         got = some(link, 6)
         assert [(p.data, p.route) for p in got] == [
-            (b"%s %d" % (word, i), route_of(sock))
-            for i, sock in enumerate(peers[:3])
-            for word in (b"first", b"second")
+            (b"%s %d" % (word, i), route_of(sock)) for i, sock in enumerate(peers[:3]) for word in (b"first", b"second")
         ]
         assert [p.t_ns for p in got] == sorted(p.t_ns for p in got)
         unix_ns = got[-1].t_ns + link.unix_offset_ns

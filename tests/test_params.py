@@ -76,11 +76,7 @@ class Bench:
         return [m for _, m, _ in self.said[before:]]
 
     def values(self) -> list[tuple[str, int, int]]:
-        return [
-            (m.param_id, m.param_index, m.param_count)
-            for _, m, _ in self.said
-            if m.get_type() == "PARAM_VALUE"
-        ]
+        return [(m.param_id, m.param_index, m.param_count) for _, m, _ in self.said if m.get_type() == "PARAM_VALUE"]
 
 
 LIST = [
@@ -130,9 +126,7 @@ def test_read_by_name_and_by_index() -> None:
         bench.read("MMAG_RATE", -1, 7, 0),
         bench.read("", 2, 7, 0),
     ):
-        assert [(m.param_id, m.param_index, m.param_count, m.param_value) for m in answer] == [
-            ("MMAG_RATE", 2, 5, 2.0)
-        ]
+        assert [(m.param_id, m.param_index, m.param_count, m.param_value) for m in answer] == [("MMAG_RATE", 2, 5, 2.0)]
 
 
 def test_AT9a_a_full_list_survives_thirty_percent_loss_by_index() -> None:
@@ -177,9 +171,7 @@ def test_set_is_echoed_at_once_with_true_index_to_everybody() -> None:
     ("MMAG_OFS_X", 3.0, f32(0.1), 5), ("MMAG_RATE", 51.0, 2.0, 2), ("MMAG_RATE", NAN, 2.0, 2),
     ("MMAG_RATE", math.inf, 2.0, 2), ("MMAG_UPLOAD", NAN, 0.0, 2),
 ])  # fmt: skip
-def test_a_refused_set_gives_the_old_value_and_the_reason(
-    name: str, value: float, old: float, error: int
-) -> None:
+def test_a_refused_set_gives_the_old_value_and_the_reason(name: str, value: float, old: float, error: int) -> None:
     bench = Bench()
     echo, why = bench.set(name, value)
     assert (echo.get_type(), echo.param_id, echo.param_value) == ("PARAM_VALUE", name, old)

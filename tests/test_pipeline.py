@@ -15,7 +15,14 @@ from magmav.settings import Settings, with_value
 
 def bits(records):
     return [
-        (r.boot_ns, r.offsets_mg.tobytes(), r.sigma_mg.tobytes(), r.heading, r.verdict, r.mag_b_mg.tobytes())
+        (
+            r.boot_ns,
+            r.estimate.hard_iron_b_mg.tobytes(),
+            r.sigma_mg.tobytes(),
+            r.heading,
+            r.verdict,
+            r.mag_b_mg.tobytes(),
+        )
         for r in records
     ]
 

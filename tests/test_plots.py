@@ -29,8 +29,7 @@ def flown():
     hard_iron = HARD_IRON_MG * (1 - np.exp(-t / 8.0))[:, None]
     corrected = flight.sensor_b_mg - hard_iron
     stored, heading = (
-        magnetic_heading_rad(field, flight.roll_rad, flight.pitch_rad)
-        for field in (flight.sensor_b_mg, corrected)
+        magnetic_heading_rad(field, flight.roll_rad, flight.pitch_rad) for field in (flight.sensor_b_mg, corrected)
     )
     heading = np.where(t > 3.0, heading, np.nan)
     trace = Trace(
@@ -79,13 +78,9 @@ def words(figure):
 def test_the_drawn_error_is_the_scored_error(tmp_path, flown):
     trace, flight = flown
     yes = np.ones(len(flight.boot_s), dtype=bool)
-    reference = Reference(
-        "SIM yaw", flight.boot_s, flight.roll_rad, flight.pitch_rad, flight.yaw_rad, yes, yes
-    )
+    reference = Reference("SIM yaw", flight.boot_s, flight.roll_rad, flight.pitch_rad, flight.yaw_rad, yes, yes)
     score = score_heading(trace.boot_s, trace.heading_true_rad, reference)
-    seen = trace.against(
-        reference.interpolate(trace.boot_s).yaw_true_rad, 91.23, score.rms_deg, (20.0, 70.0), 20.0
-    )
+    seen = trace.against(reference.interpolate(trace.boot_s).yaw_true_rad, 91.23, score.rms_deg, (20.0, 70.0), 20.0)
     figure = plot_replay(tmp_path / "r.png", [seen], "flight.tlog", reference.name)
 
     x, before = drawn(figure, "Heading error against SIM yaw", "as streamed: 91.2 deg RMS")
@@ -108,17 +103,13 @@ def test_the_drawn_error_is_the_scored_error(tmp_path, flown):
 def test_offsets_are_drawn_with_their_sigma_and_what_is_not_known_is_left_out(picture, flown):
     trace, _ = flown
     figure = picture
-    for i, label in enumerate(
-        ("x forward -310 ± 2.0 mG", "y right 140 ± 3.0 mG", "z down -220 mG (from field")
-    ):
+    for i, label in enumerate(("x forward -310 ± 2.0 mG", "y right 140 ± 3.0 mG", "z down -220 mG (from field")):
         x, y = drawn(figure, "Offsets to store", label)
         assert np.array_equal(x, trace.boot_s) and np.array_equal(y, trace.offsets_mg[:, i])
     (axes,) = [a for a in figure.get_axes() if a.get_title(loc="left").startswith("Offsets")]
     band = axes.collections[1].get_paths()[0].vertices
     at_end = band[np.isclose(band[:, 0], trace.boot_s[-1])][:, 1]
-    assert (at_end.min(), at_end.max()) == pytest.approx(
-        (trace.offsets_mg[-1, 1] - 3, trace.offsets_mg[-1, 1] + 3)
-    )
+    assert (at_end.min(), at_end.max()) == pytest.approx((trace.offsets_mg[-1, 1] - 3, trace.offsets_mg[-1, 1] + 3))
 
 
 def test_the_field_is_drawn_on_equal_axes_round_its_sphere(picture, flown):
@@ -126,9 +117,7 @@ def test_the_field_is_drawn_on_equal_axes_round_its_sphere(picture, flown):
     figure = picture
     for title, across, up in (("Field from above (circle: 477 mG)", 1, 0), ("Field from the side", 0, 2)):
         x, y = drawn(figure, title, "corrected")
-        assert np.array_equal(x, trace.corrected_b_mg[:, across]) and np.array_equal(
-            y, trace.corrected_b_mg[:, up]
-        )
+        assert np.array_equal(x, trace.corrected_b_mg[:, across]) and np.array_equal(y, trace.corrected_b_mg[:, up])
         x, y = drawn(figure, title, "as streamed")
         assert np.array_equal(x, trace.stored_b_mg[:, across]) and np.array_equal(y, trace.stored_b_mg[:, up])
         (axes,) = [a for a in figure.get_axes() if a.get_title(loc="left").startswith(title)]
@@ -211,9 +200,7 @@ def test_the_demo_draws_both_flights_and_the_offsets_against_the_truth(tmp_path)
     notes = [t.get_text() for a in figure.get_axes() for t in a.texts]
     assert notes == ["off by +1.0 ± 1.0 mG", "off by +1.0 ± 1.0 mG", "off by -2.0 ± 3.0 mG"]
     panels = {a.get_title(loc="left"): a for a in figure.get_axes()}
-    assert (
-        panels["First flight: old offsets"].get_ylim() == panels["Second flight: uploaded offsets"].get_ylim()
-    )
+    assert panels["First flight: old offsets"].get_ylim() == panels["Second flight: uploaded offsets"].get_ylim()
     assert panels["First flight: old offsets"].get_ylabel() == "error against simulated truth, deg"
     assert panels["The second flight magnified"].get_ylim() == (-1.0, 1.0)
 
@@ -222,9 +209,7 @@ def test_the_demo_draws_both_flights_and_the_offsets_against_the_truth(tmp_path)
 
 
 def record_at(i, **changes):
-    return make(
-        0, boot_ns=i * 20_000_000, mag_b_mg=vec3((i, 0, 0), "m"), stored_b_mg=vec3((i, 1, 2), "s"), **changes
-    )
+    return make(0, boot_ns=i * 20_000_000, mag_b_mg=vec3((i, 0, 0), "m"), stored_b_mg=vec3((i, 1, 2), "s"), **changes)
 
 
 def test_a_trace_says_what_the_records_said():

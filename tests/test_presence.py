@@ -15,9 +15,7 @@ from magmav.mavlink.presence import Presence
 WIRE = Wire()
 
 
-def heartbeat(
-    system: int = 1, component: int = 1, autopilot: int = 3, kind: int = 2, armed: bool = False
-) -> Any:
+def heartbeat(system: int = 1, component: int = 1, autopilot: int = 3, kind: int = 2, armed: bool = False) -> Any:
     message = dialect.MAVLink_heartbeat_message(kind, autopilot, 128 * armed, 0, 4, 3)
     return WIRE.carry(message, system, component)
 
@@ -187,9 +185,7 @@ def test_file_requests_are_refused_the_way_mavlink_ftp_does() -> None:
 
     (reply,) = presence.on_message(ftp(asked, 7, 191), "gcs", 4 * S)
     nak = bytes(WIRE.carry(reply.message, 7, 191).payload)
-    assert (
-        nak[:6] == bytes((0, 0, 5, 129, 1, 4)) and nak[12] == 10
-    )  # seq wraps; NAK of opcode 4: no such file
+    assert nak[:6] == bytes((0, 0, 5, 129, 1, 4)) and nak[12] == 10  # seq wraps; NAK of opcode 4: no such file
     assert presence.on_message(ftp(asked, 7, 1), "gcs", 4 * S) == []
     answer = asked[:3] + bytes((128,)) + asked[4:]
     assert presence.on_message(ftp(answer, 7, 191), "gcs", 4 * S) == [], "an answer is not answered"
@@ -198,9 +194,7 @@ def test_file_requests_are_refused_the_way_mavlink_ftp_does() -> None:
 KINDS = sorted(dialect.mavlink_map.values(), key=lambda kind: kind.id)
 
 
-@given(
-    st.sampled_from(KINDS), st.binary(min_size=255, max_size=255), st.integers(0, 255), st.integers(0, 255)
-)
+@given(st.sampled_from(KINDS), st.binary(min_size=255, max_size=255), st.integers(0, 255), st.integers(0, 255))
 @settings(max_examples=150, deadline=None)
 def test_no_message_makes_it_raise(kind: Any, payload: bytes, system: int, component: int) -> None:
     presence = Presence()

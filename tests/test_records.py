@@ -100,9 +100,7 @@ def test_a_heading_just_under_north_is_zero_and_never_360():
 
 
 def test_a_heading_without_declination_is_magnetic_only():
-    got = row(
-        make(heading=Heading(True, False, 1.0, 2.0, 0.1), stored_heading=Heading(True, True, 1.0, 2.0, 0.1))
-    )
+    got = row(make(heading=Heading(True, False, 1.0, 2.0, 0.1), stored_heading=Heading(True, True, 1.0, 2.0, 0.1)))
     assert (got["heading_deg"], got["heading_true_deg"]) == (57.2958, None)
     assert (got["stored_heading_deg"], got["stored_heading_true_deg"]) == (57.2958, 114.5916)
 

@@ -81,9 +81,7 @@ def test_nothing_is_made_up_outside_the_series_or_inside_a_gap():
     assert np.array_equal(np.isnan(got.yaw_true_rad), ~got.valid)
     assert Reference.from_attitude([]).interpolate([1.0, 2.0]).valid.tolist() == [False, False]
     one = Reference.from_attitude([attitude(3.0, 0, 0, 77)]).interpolate([2.9, 3.0, 3.1])
-    assert one.valid.tolist() == [False, True, False] and math.degrees(one.yaw_true_rad[1]) == pytest.approx(
-        77
-    )
+    assert one.valid.tolist() == [False, True, False] and math.degrees(one.yaw_true_rad[1]) == pytest.approx(77)
 
 
 def test_attitude_at_two_a_second_is_bridged_at_every_boot_time():
@@ -111,9 +109,7 @@ def test_flags_hold_from_their_own_time_on():
 
 def test_a_truth_file_is_read_whatever_the_order_of_its_columns(tmp_path):
     path = tmp_path / "truth.csv"
-    path.write_text(
-        "\ufeffheading_true_deg, pitch_deg,note,roll_deg,boot_time_s\n359,1,a,-2,10.0\n\n1,3,b,4,10.2\n"
-    )
+    path.write_text("\ufeffheading_true_deg, pitch_deg,note,roll_deg,boot_time_s\n359,1,a,-2,10.0\n\n1,3,b,4,10.2\n")
     reference = Reference.from_csv(path)
     assert reference.name == "file truth.csv"
     got = reference.interpolate([10.1])
@@ -218,9 +214,7 @@ def test_headings_that_are_compared_share_their_samples():
     assert both["early"].n == both["late"].n == 4
     assert both["early"].excluded == {"no heading": 6}
     assert both["early"].rms_deg == pytest.approx(math.sqrt((36 + 49 + 64 + 81) / 4))
-    again = score_heading(
-        t, np.zeros(10), yaw_only(t, np.zeros(10)), leave_out={"no heading": np.isnan(late)}
-    )
+    again = score_heading(t, np.zeros(10), yaw_only(t, np.zeros(10)), leave_out={"no heading": np.isnan(late)})
     assert (again.n, again.excluded) == (
         4,
         {"no heading": 6},
@@ -231,9 +225,7 @@ def test_a_field_is_scored_with_the_references_own_tilt():
     flight = fly()
     good = score_field(flight.boot_s, flight.true_b_mg, DECLINATION_RAD, reference_of(flight))
     assert good.rms_deg == pytest.approx(0.0, abs=1e-9) and good.n == len(flight.boot_s)
-    turned = score_field(
-        flight.boot_s, flight.true_b_mg, DECLINATION_RAD + math.radians(4), reference_of(flight)
-    )
+    turned = score_field(flight.boot_s, flight.true_b_mg, DECLINATION_RAD + math.radians(4), reference_of(flight))
     assert turned.rms_deg == pytest.approx(4.0) and turned.bias_deg == pytest.approx(4.0)
     short = reference_of(flight._replace(**{k: v[:500] for k, v in flight._asdict().items()}))
     assert score_field(flight.boot_s, flight.true_b_mg, DECLINATION_RAD, short).excluded == {
@@ -264,14 +256,10 @@ def test_freezing_the_right_calibration_removes_the_error_and_a_wrong_one_does_n
     transposed = Calibration(HARD_IRON_MG, [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]])
     by_hand = np.array([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]) @ (flight.sensor_b_mg[9] - HARD_IRON_MG)
     want = magnetic_heading_rad([by_hand], flight.roll_rad[9:10], flight.pitch_rad[9:10])
-    got = score_freeze(
-        flight.boot_s[9:10], flight.sensor_b_mg[9:10], {"t": transposed}, 0.0, reference_of(flight)
-    )
+    got = score_freeze(flight.boot_s[9:10], flight.sensor_b_mg[9:10], {"t": transposed}, 0.0, reference_of(flight))
     assert got["t"].bias_deg == pytest.approx(float(np.degrees(shortest_rad(want - flight.yaw_rad[9])[0])))
     with pytest.raises(ValueError, match="odd: want hard iron"):
-        score_freeze(
-            flight.boot_s, flight.sensor_b_mg, {"odd": Calibration([1, 2])}, 0.0, reference_of(flight)
-        )
+        score_freeze(flight.boot_s, flight.sensor_b_mg, {"odd": Calibration([1, 2])}, 0.0, reference_of(flight))
 
 
 def test_the_error_series_is_what_the_score_is_made_of():

@@ -208,9 +208,7 @@ def test_unknown_commands_are_unsupported_and_calibration_is_refused_armed(groun
 def test_arming_is_refused_without_offsets_when_checks_are_on():
     ground = Ground(simulation(COMPASS + "[autopilot.parameters]\nARMING_CHECK = 1\n"))
     assert ground.command(400, 1) == FAILED
-    assert [m.text for m in ground.heard if m.get_type() == "STATUSTEXT"] == [
-        "PreArm: Compass not calibrated"
-    ]
+    assert [m.text for m in ground.heard if m.get_type() == "STATUSTEXT"] == ["PreArm: Compass not calibrated"]
     ground.set("COMPASS_OFS_X", -100.0)
     assert ground.command(400, 1) == ACCEPTED
 

@@ -222,9 +222,7 @@ def test_specific_force_is_acceleration_less_gravity(name):
          for i in range(0, len(acceleration), 10)]
     )  # fmt: skip
     miss = flown.force[10 : len(acceleration) + 10 : 10] - expected
-    assert (
-        np.sqrt(np.median(np.sum(miss**2, axis=1))) < 0.35
-    )  # pilot's seat off the centre, gusts within 0.2 s
+    assert np.sqrt(np.median(np.sum(miss**2, axis=1))) < 0.35  # pilot's seat off the centre, gusts within 0.2 s
     still = flown.t < 2
     np.testing.assert_allclose(np.linalg.norm(flown.force[still], axis=1), 9.80665, atol=1e-6)
 
@@ -284,9 +282,7 @@ def test_glider_weaves_down_to_the_ground():
 def test_command_starts_the_second_flight_and_nothing_else_does():
     flight = '[[flight]]\nstart = "command"\nwait_s = 50.0\n'
     flight += 'pattern = [{ kind = "takeoff", height_m = 3.0 }, { kind = "land" }]\n'
-    sim = simulation(
-        "[[compass]]\ndevice_id = 1\nhard_iron_mg = [0.0, 0.0, 0.0]\n" + flight, top="end_ground_s = 2.0"
-    )
+    sim = simulation("[[compass]]\ndevice_id = 1\nhard_iron_mg = [0.0, 0.0, 0.0]\n" + flight, top="end_ground_s = 2.0")
     ground = Ground(sim)
     ground.run(20.0)
     assert sim.truth.height_m == 0 and not sim.truth.armed
@@ -301,12 +297,8 @@ def test_command_starts_the_second_flight_and_nothing_else_does():
 
 
 def test_command_flight_that_nobody_starts_ends_the_simulation():
-    flight = (
-        '[[flight]]\nstart = "command"\nwait_s = 5.0\npattern = [{ kind = "takeoff" }, { kind = "land" }]\n'
-    )
-    sim = simulation(
-        "[[compass]]\ndevice_id = 1\nhard_iron_mg = [0.0, 0.0, 0.0]\n" + flight, top="end_ground_s = 2.0"
-    )
+    flight = '[[flight]]\nstart = "command"\nwait_s = 5.0\npattern = [{ kind = "takeoff" }, { kind = "land" }]\n'
+    sim = simulation("[[compass]]\ndevice_id = 1\nhard_iron_mg = [0.0, 0.0, 0.0]\n" + flight, top="end_ground_s = 2.0")
     sim.advance(6.5)
     assert not sim.finished
     sim.advance(1.0)

@@ -53,9 +53,7 @@ def test_offsets_are_added_before_scale():
 
 @pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (0.6, 1), (0.67, 0.67), (1.5, 1.5), (1.6, 1)])
 def test_scale_counts_only_from_two_thirds_to_three_halves(scale, factor):
-    np.testing.assert_allclose(
-        correction(scale=scale).apply((100, 0, -50), 0, 0), (100 * factor, 0, -50 * factor)
-    )
+    np.testing.assert_allclose(correction(scale=scale).apply((100, 0, -50), 0, 0), (100 * factor, 0, -50 * factor))
 
 
 def test_matrix_is_symmetric_and_follows_the_scale():
@@ -79,8 +77,7 @@ def test_motor_term_comes_last_and_follows_its_selector(by, share):
 def test_stream_cuts_towards_zero():
     # North field about 215 mG: a scale puts known fractions on it.
     sim = iron_free(
-        "COMPASS_DIA_X = 0.001\nCOMPASS_DIA_Y = 0.001\nCOMPASS_DIA_Z = 0.001\n"
-        "COMPASS_OFS_X = 0\nCOMPASS_MOTCT = 1\n"
+        "COMPASS_DIA_X = 0.001\nCOMPASS_DIA_Y = 0.001\nCOMPASS_DIA_Z = 0.001\nCOMPASS_OFS_X = 0\nCOMPASS_MOTCT = 1\n"
     )
     ground = Ground(sim)
     ground.stream(27, 50)
@@ -171,9 +168,7 @@ def test_motor_current_moves_the_field_by_its_share():
 def test_heading_formula_against_a_field_built_the_other_way():
     for heading in np.radians((10, 100, 200, 300)):
         field = body_from_ned(0.2, -0.3, heading) @ np.array((215.0, 0.0, 430.0))
-        assert math.remainder(heading_rad(tuple(field), 0.2, -0.3) - heading, math.tau) == pytest.approx(
-            0, abs=1e-9
-        )
+        assert math.remainder(heading_rad(tuple(field), 0.2, -0.3) - heading, math.tau) == pytest.approx(0, abs=1e-9)
 
 
 FAULTS = (

@@ -32,9 +32,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield opened
 
 
-def upload(
-    store: Store, change: Change = CHANGE, result: UploadResult = UploadResult.ALL_NEW, **more: int
-) -> int:
+def upload(store: Store, change: Change = CHANGE, result: UploadResult = UploadResult.ALL_NEW, **more: int) -> int:
     row = store.begin(change, 5, **more)
     store.finish(row, result, ())
     return row

@@ -71,10 +71,7 @@ def test_a_recordings_table_says_what_the_json_says():
     ):
         assert words in text
     assert (
-        "unknown 0" not in text
-        and "link" not in text
-        and "early" not in text
-        and "follows its own compass" not in text
+        "unknown 0" not in text and "link" not in text and "early" not in text and "follows its own compass" not in text
     )
 
 
@@ -92,9 +89,7 @@ def test_single_unknown_numbers_do_not_hide_the_known_ones():
     (line,) = [line for line in text.splitlines() if line.strip().startswith("y right")]
     assert line.split()[2:6] == ["not", "known", "not", "known"]
     empty = {**COMPASS["heading"], "n": 0, "rms_deg": None, "from_s": None, "to_s": None}
-    assert "against file truth.csv: no sample to score; left out: disarmed 123" in text_of(
-        changed(heading=empty)
-    )
+    assert "against file truth.csv: no sample to score; left out: disarmed 123" in text_of(changed(heading=empty))
 
 
 def test_a_change_relative_to_unknown_offsets_is_called_a_change():

@@ -17,6 +17,7 @@ _FIXED_WING = 1
 _ALOFT_M = 5.0
 _FAST_MPS = 8.0
 _BLIND_S = 10.0  # armed this long with neither height nor landed state known counts as flying
+_WHO_S = 3.0  # heartbeats come once a second: after this long without one nobody will say what it is
 _CRASH_TILT_RAD = math.radians(100.0)
 _CRASH_S = 1.0
 
@@ -28,6 +29,7 @@ class Phase:
         self.kind: int | None = None
         self.armed = False
         self.takeoff_ns: int | None = None
+        self._first_ns: int | None = None
         self.crash_ns: int | None = None
         self._landed: Landed | None = None
         self._armed_ns: int | None = None
@@ -96,6 +98,10 @@ class Phase:
     def learnable(self, boot_ns: int, on_ground: bool) -> bool:
         """Does time at this boot time teach? ``on_ground`` is the operator saying that it always does."""
         aloft = self.aloft(boot_ns)
+        if self.kind is None:
+            self._first_ns = boot_ns if self._first_ns is None else self._first_ns
+            if boot_ns - self._first_ns < _WHO_S * 1e9:
+                return on_ground  # it may yet say that it flies, and stand on steel now
         if self.crash_ns is not None:
             return False
         return aloft or on_ground or not self.flyer

@@ -106,9 +106,7 @@ class RecordCutter:
             else:  # a silence, unless the one behind comes before
                 damaged = plausible(behind_us or 0, now_us) and (behind_us or 0) < then_us - _SECOND_US
             self._next(out, end, None if damaged else then_us)
-        elif (returns and record_size(*data[after + STAMP : after + HEAD.size])) or (
-            after == len(data) and self._last
-        ):
+        elif (returns and record_size(*data[after + STAMP : after + HEAD.size])) or (after == len(data) and self._last):
             self._next(out, end, None)
         else:
             self._break(out)  # a clock set by more than a day is found from there

@@ -33,9 +33,7 @@ class MemoryLink:
     A packet carries the time at which it is taken out, as a socket's would. route is the other end's name.
     """
 
-    def __init__(
-        self, name: str, clock_ns: Callable[[], int], *, datagrams: bool, unix_offset_ns: int
-    ) -> None:
+    def __init__(self, name: str, clock_ns: Callable[[], int], *, datagrams: bool, unix_offset_ns: int) -> None:
         self.name = name
         self.datagrams = datagrams
         self.unix_offset_ns = unix_offset_ns
@@ -78,8 +76,6 @@ def memory_pair(
     """Two ends joined: what one sends the other yields, on one shared clock (a SetClock, or any callable)."""
     if names[0] == names[1]:
         raise ValueError(f"names: the two ends need different names, got {names!r}")
-    here, there = (
-        MemoryLink(name, clock_ns, datagrams=datagrams, unix_offset_ns=unix_offset_ns) for name in names
-    )
+    here, there = (MemoryLink(name, clock_ns, datagrams=datagrams, unix_offset_ns=unix_offset_ns) for name in names)
     here._other, there._other = there, here
     return here, there

@@ -69,9 +69,7 @@ def _device(text: str, rest: str) -> tuple[str, int]:
     if not colon or Path(rest).exists():  # names under /dev/serial/by-path have colons of their own
         device, baud = rest, str(_BAUD)
     if not device:
-        raise LinkError(
-            f"{text}: the device is missing, as in serial:/dev/ttyACM0:{_BAUD}; links are {FORMS}"
-        )
+        raise LinkError(f"{text}: the device is missing, as in serial:/dev/ttyACM0:{_BAUD}; links are {FORMS}")
     if not (baud.isascii() and baud.isdecimal()) or not 0 < int(baud) < 1 << 31:
         raise LinkError(f"{text}: {baud!r} is not a baud rate; links are {FORMS}")
     return device, int(baud)

@@ -93,13 +93,7 @@ class StreamLink:
 
     def send(self, data: bytes, route: str = "") -> None:
         """Send all of it or, when there is no room or no link, none."""
-        if (
-            not data
-            or self._port is None
-            or not self._connected
-            or self._closed
-            or route not in ("", self.route)
-        ):
+        if not data or self._port is None or not self._connected or self._closed or route not in ("", self.route):
             self.counts["not sent"] += 1
         elif len(self._unsent) + len(data) > self._most_unsent:
             self.counts["dropped sends"] += 1

@@ -157,14 +157,10 @@ def udp_in(
     except OSError as error:
         sock.close()
         raise LinkError(f"{name}: {why_not_bound(error, host, port)}") from error
-    return UdpLink(
-        name, sock, peer=None, tick_s=tick_s, clock_ns=clock_ns, most_peers=most_peers, forget_s=forget_s
-    )
+    return UdpLink(name, sock, peer=None, tick_s=tick_s, clock_ns=clock_ns, most_peers=most_peers, forget_s=forget_s)
 
 
-def udp_out(
-    host: str, port: int, *, tick_s: float = 0.05, clock_ns: Callable[[], int] = time.monotonic_ns
-) -> UdpLink:
+def udp_out(host: str, port: int, *, tick_s: float = 0.05, clock_ns: Callable[[], int] = time.monotonic_ns) -> UdpLink:
     """Talk to one peer, hear only it. LinkError when there is no way to it; that nobody listens is no error.
 
     The socket stays unconnected, so that it survives a change of our own address (a radio that comes back).
@@ -175,9 +171,7 @@ def udp_out(
         try:
             probe.connect(address)
         except OSError as error:
-            raise LinkError(
-                f"{name}: no way to {host}: {error.strerror}; check address and network"
-            ) from error
+            raise LinkError(f"{name}: no way to {host}: {error.strerror}; check address and network") from error
     sock = socket.socket(family, socket.SOCK_DGRAM)
     nowhere = "::" if family == socket.AF_INET6 else "0.0.0.0"
     sock.bind((str(address[0]) if is_loopback(str(address[0])) else nowhere, 0))

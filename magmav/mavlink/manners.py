@@ -36,9 +36,7 @@ class Manners:
         elif kind == "FILE_TRANSFER_PROTOCOL":
             answer = _no_such_file(message, sender)
         else:
-            answer = dialect.MAVLink_command_ack_message(
-                message.command, dialect.MAV_RESULT_UNSUPPORTED, 0, 0, *sender
-            )
+            answer = dialect.MAVLink_command_ack_message(message.command, dialect.MAV_RESULT_UNSUPPORTED, 0, 0, *sender)
         return [] if answer is None else [Outgoing(answer, route)]
 
     def _ping(self, message: Message, sender: tuple[int, int], we: tuple[int, int]) -> Message | None:

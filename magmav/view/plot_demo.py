@@ -110,9 +110,7 @@ def _offsets(axes: Axes, offsets: Sequence[DemoOffsets]) -> None:
     for y, (o, i) in enumerate(rows):
         axes.plot([o.old_mg[i], o.new_mg[i]], [y, y], color=FAINT, lw=1.2, zorder=1)
         error = f"off by {o.new_mg[i] - o.true_mg[i]:+.1f} ± {o.sigma_mg[i]:.1f} mG"
-        axes.annotate(
-            error, (o.true_mg[i], y), (0, 13), textcoords="offset points", ha="center", fontsize=8.5
-        )
+        axes.annotate(error, (o.true_mg[i], y), (0, 13), textcoords="offset points", ha="center", fontsize=8.5)
     at = np.arange(len(rows), dtype=np.float64)
     old, new, true = (np.array([getattr(o, n)[i] for o, i in rows]) for n in ("old_mg", "new_mg", "true_mg"))
     axes.plot(true, at, ls="none", marker="|", ms=17, mew=2.2, color=INK, label="truth", zorder=2)

@@ -44,9 +44,7 @@ _DOUBTS = {
 }
 
 
-def plot_replay(
-    path_png: str | Path, traces: Sequence[Trace], title: str, reference_name: str | None
-) -> Figure:
+def plot_replay(path_png: str | Path, traces: Sequence[Trace], title: str, reference_name: str | None) -> Figure:
     """Draw every compass of a recording into one PNG and give back the figure it was made from.
 
     Per compass: offsets with one sigma; heading error as streamed and corrected, then the corrected one
@@ -61,9 +59,7 @@ def plot_replay(
         raise ValueError("traces: nothing to draw")
     with rc_context(STYLE):
         figure = Figure(figsize=(13.0, 0.5 + 8.2 * len(traces)), dpi=DPI, layout="constrained")
-        against = (
-            f"heading errors against {reference_name}" if reference_name else "heading errors: not known"
-        )
+        against = f"heading errors against {reference_name}" if reference_name else "heading errors: not known"
         figure.suptitle(plain(f"{title}   ({against})"), fontsize=13, fontweight="bold", x=0.01, ha="left")
         blocks = figure.subfigures(len(traces), 1, squeeze=False)[:, 0]
         for block, trace in zip(blocks, traces, strict=True):
@@ -119,9 +115,7 @@ def _errors(both: Axes, close: Axes, trace: Trace, reference: str) -> None:
     dots(both, trace.boot_s, after, AFTER, "corrected" + rms_text(trace.rms_after_deg))
     heading_axis(both, np.concatenate((before, after)))
     sigma = np.degrees(trace.heading_sigma_rad)
-    close.fill_between(
-        trace.boot_s, -sigma, sigma, color=BAND, alpha=0.35, linewidth=0, label="one sigma, as claimed"
-    )
+    close.fill_between(trace.boot_s, -sigma, sigma, color=BAND, alpha=0.35, linewidth=0, label="one sigma, as claimed")
     dots(close, trace.boot_s, after, AFTER, "corrected")
     heading_axis(close, _settled(after))
     _marks(both, trace)
@@ -144,9 +138,7 @@ def _headings(both: Axes, close: Axes, trace: Trace) -> None:
     heading_axis(close, turned, "turn, deg")
     _marks(both, trace)
     _marks(close, trace)
-    caption(
-        both, f"Heading, {'true' if true else 'magnetic'} north (no reference, so its error is not known)"
-    )
+    caption(both, f"Heading, {'true' if true else 'magnetic'} north (no reference, so its error is not known)")
     caption(close, "How far the correction turns the heading")
 
 

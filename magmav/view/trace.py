@@ -162,9 +162,7 @@ class _Series:
 
 def _row(record: Record) -> tuple[float, ...]:
     heading = record.heading
-    known = (
-        record.estimate.samples > 0
-    )  # before that the offsets are where the estimator starts, not an answer
+    known = record.estimate.samples > 0  # before that the offsets are where the estimator starts, not an answer
     sigma = record.sigma_mg if known else _NONE
     return (
         record.boot_ns / 1e9,

@@ -180,11 +180,7 @@ class Autopilot:
 
     def _swap_devices(self) -> None:
         for fault in self._faults:
-            if (
-                isinstance(fault, DeviceId)
-                and fault not in self._swapped
-                and fault.active(self.elapsed_ns / 1e9)
-            ):
+            if isinstance(fault, DeviceId) and fault not in self._swapped and fault.active(self.elapsed_ns / 1e9):
                 self._swapped.add(fault)
                 self.parameters.put(compass_name("DEV_ID", fault.compass), fault.device_id)
                 self.note("device_id", compass=fault.compass, device_id=fault.device_id)
@@ -218,6 +214,4 @@ class Autopilot:
 
     def note(self, what: str, **more: object) -> None:
         """Remember an event for the truth file."""
-        self.events.append(
-            {"boot_s": self.boot_ns / 1e9, "elapsed_s": self.elapsed_ns / 1e9, "what": what, **more}
-        )
+        self.events.append({"boot_s": self.boot_ns / 1e9, "elapsed_s": self.elapsed_ns / 1e9, "what": what, **more})

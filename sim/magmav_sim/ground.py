@@ -20,9 +20,7 @@ _ROLL_OUT_MSS = 3.0
 
 def parked(north_m: float, east_m: float, heading_rad: float) -> State:
     """Standing still on ground that is not quite level."""
-    return _posed(
-        PARKED_ROLL_RAD, PARKED_PITCH_RAD, heading_rad, (0, 0), (north_m, east_m, 0), (0, 0, 0), (0, 0, 0)
-    )
+    return _posed(PARKED_ROLL_RAD, PARKED_PITCH_RAD, heading_rad, (0, 0), (north_m, east_m, 0), (0, 0, 0), (0, 0, 0))
 
 
 def settle(touch: State) -> Iterator[State]:

@@ -62,9 +62,7 @@ def _attitude(a: Autopilot) -> Any:
 
 def _quaternion(a: Autopilot) -> Any:
     s, b = a.state, a.gyro_bias_rads
-    (sr, cr), (sp, cp), (sy, cy) = (
-        (math.sin(x / 2), math.cos(x / 2)) for x in (a.roll_rad, a.pitch_rad, a.yaw_rad)
-    )
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(x / 2), math.cos(x / 2)) for x in (a.roll_rad, a.pitch_rad, a.yaw_rad))
     return dialect.MAVLink_attitude_quaternion_message(
         a.boot_ms,
         cr * cp * cy + sr * sp * sy,

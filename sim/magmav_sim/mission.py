@@ -118,9 +118,7 @@ class Mission:
         meanwhile."""
         a, model = self._a, self._scenario.airframe
         air = Airframe(model, a.home, self.state)
-        pilot = (
-            QuadPilot(self._scenario.autopilot.velocity_noise_mps, self._rng) if a.quad else PlanePilot(model)
-        )
+        pilot = QuadPilot(self._scenario.autopilot.velocity_noise_mps, self._rng) if a.quad else PlanePilot(model)
         stood, shift = self.state, None if a.quad else (0.0, 0.0, 0.0)
         for leg in flight.pattern:
             a.note("pattern", kind=type(leg).__struct_config__.tag)

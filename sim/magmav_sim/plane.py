@@ -94,11 +94,7 @@ class PlanePilot:
         r_turn = g_turn * math.cos(state.roll_rad)
         pitch_miss = pitch - state.pitch_rad
         self._pitch_sum = _limit(self._pitch_sum + pitch_miss * FRAME_S, 0.5)
-        up = (
-            tune.pitch * pitch_miss
-            + tune.pitch_sum * self._pitch_sum
-            + tune.pitch_damp * (q_turn - state.q_rads)
-        )
+        up = tune.pitch * pitch_miss + tune.pitch_sum * self._pitch_sum + tune.pitch_damp * (q_turn - state.q_rads)
         self._bank += _limit(demand.bank_rad - self._bank, _BANK_RATE_RADS * FRAME_S)
         roll_miss = self._bank - state.roll_rad
         self._roll_sum = _limit(self._roll_sum + 0.3 * roll_miss * FRAME_S, 0.15)

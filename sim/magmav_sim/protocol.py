@@ -38,9 +38,7 @@ class Protocol:
     pong : the sequence number of the last PING of ours that somebody answered; -1 before the first.
     """
 
-    def __init__(
-        self, autopilot: Autopilot, streams: Streams, faults: list[AnyFault], fly: Callable[[], bool]
-    ) -> None:
+    def __init__(self, autopilot: Autopilot, streams: Streams, faults: list[AnyFault], fly: Callable[[], bool]) -> None:
         self._a = autopilot
         self._streams = streams
         self._deaf = [f for f in faults if isinstance(f, Deaf)]
@@ -111,9 +109,7 @@ class Protocol:
     def _tell(self, name: str, index: int) -> None:
         table = self._a.parameters
         self._a.outbox.append(
-            dialect.MAVLink_param_value_message(
-                name.encode(), table[name], table.kind(name), len(table), index
-            )
+            dialect.MAVLink_param_value_message(name.encode(), table[name], table.kind(name), len(table), index)
         )
 
     # ------------------------------------------------------------ the rest

@@ -106,9 +106,7 @@ class Scenario(_Table, frozen=True, kw_only=True):
     place: Place
     heading_deg: Annotated[float, msgspec.Meta(ge=0, lt=360)] = 0.0
     wind: WindSpec = WindSpec()
-    compasses: Annotated[list[CompassSpec], msgspec.Meta(min_length=1, max_length=3)] = msgspec.field(
-        name="compass"
-    )
+    compasses: Annotated[list[CompassSpec], msgspec.Meta(min_length=1, max_length=3)] = msgspec.field(name="compass")
     anomaly: Anomaly | None = None
     autopilot: AutopilotSpec = AutopilotSpec()
     faults: list[AnyFault] = msgspec.field(name="fault", default_factory=list)

@@ -10,7 +10,7 @@ from magmav.core.types import Record
 from magmav.geomag import world_magnetic_model
 from magmav.link.recorder import TlogRecorder
 from magmav.link.tlog import TlogLink
-from magmav.replay import NothingToLearnFrom, replay
+from magmav.recording import NothingToLearnFrom, replay
 from magmav.settings import Settings
 
 # The contract of DESIGN.md: these keys stay.

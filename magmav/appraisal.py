@@ -1,0 +1,172 @@
+"""How good a calibration was over a recording: its history as columns, its scores, its entry in the result."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magmav.core.types import Heading, Record, Shaping, State
+from magmav.reference import Reference
+from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
+from magmav.vehicle import Vehicle
+
+Result = dict[str, Any]
+Floats = NDArray[np.float64]
+
+
+def _doubles() -> array[float]:
+    return array("d")
+
+
+@dataclass(slots=True)
+class CompassLog:
+    """One compass since the vehicle's last boot, a number a column: an hour of flight takes a few megabytes.
+
+    sensor holds the sensor's own field with the undone motor term, offsets what was to be stored, both (3 N,), mG.
+    Headings are NaN where none was published.
+    """
+
+    last: Record | None = None
+    learnt: int = 0
+    boot_s: array[float] = field(default_factory=_doubles)
+    age_s: array[float] = field(default_factory=_doubles)
+    sensor_b_mg: array[float] = field(default_factory=_doubles)
+    offsets_b_mg: array[float] = field(default_factory=_doubles)
+    magnetic_rad: array[float] = field(default_factory=_doubles)
+    true_rad: array[float] = field(default_factory=_doubles)
+    stored_magnetic_rad: array[float] = field(default_factory=_doubles)
+    stored_true_rad: array[float] = field(default_factory=_doubles)
+    declination_rad: array[float] = field(default_factory=_doubles)
+    sigma_rad: array[float] = field(default_factory=_doubles)
+
+    def __len__(self) -> int:
+        return len(self.boot_s)
+
+    def add(self, record: Record, shaping: Shaping) -> None:
+        """Append one record and what the autopilot did to its value after the offsets."""
+        motor = shaping.motor_b_mg
+        sensor = record.mag_b_mg + np.linalg.solve(shaping.matrix, motor) if motor.any() else record.mag_b_mg
+        started = record.verdict.state is not State.NO_DATA
+        magnetic, true = _angles(record.heading) if started else (math.nan, math.nan)
+        stored_magnetic, stored_true = _angles(record.stored_heading)
+        self.last = record
+        self.learnt += record.learnt
+        self.boot_s.append(record.boot_ns / 1e9)
+        self.age_s.append(record.age_s)
+        self.sensor_b_mg.extend(sensor)
+        self.offsets_b_mg.extend(record.offsets_mg)
+        self.magnetic_rad.append(magnetic)
+        self.true_rad.append(true)
+        self.stored_magnetic_rad.append(stored_magnetic)
+        self.stored_true_rad.append(stored_true)
+        self.declination_rad.append(stored_true - stored_magnetic)
+        self.sigma_rad.append(record.heading.sigma_rad if record.heading.valid else math.nan)
+
+
+def _angles(heading: Heading) -> tuple[float, float]:
+    magnetic = heading.magnetic_rad if heading.valid else math.nan
+    return magnetic, heading.true_rad if heading.true_valid else math.nan
+
+
+def describe(log: CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None) -> Result:
+    """One compass's entry in the result. Numbers that are not known are None. ValueError for an empty log."""
+    last = log.last
+    if last is None:
+        raise ValueError("log: nothing was recorded of this compass")
+    compass, known = last.compass, last.estimate.samples > 0
+    absolute = known and not last.relative
+    numbers = [round(float(v), 3) for v in last.offsets_mg]
+    own = [round(float(v), 3) for v in last.estimate.own_sigma_mg]
+    full, offsets_only = scores(log, vehicle, reference, learn_for_s)
+    return {
+        "compass": compass,
+        "device_id": last.device_id or None,
+        "offsets_mg": numbers if absolute else None,
+        "offsets_change_mg": numbers if known and not absolute else None,
+        "relative": last.relative,
+        "stored": vehicle.calibrations.stored(compass),
+        "hard_iron_mg": [round(float(v), 3) for v in last.estimate.hard_iron_b_mg] if absolute else None,
+        "sigma_mg": [round(float(v), 3) for v in last.sigma_mg] if known else None,
+        "sigma_by_motion_mg": own if known else None,
+        "axes": [a.value for a in last.verdict.axes],
+        "state": last.verdict.state.name,
+        "reasons": [{"code": r.name, "text": r.text} for r in last.verdict.reasons],
+        "heading": full,
+        "heading_offsets_only": offsets_only,
+        "delay_s": round(last.estimate.delay_s, 4) if known else None,
+        "field_residual_mg": round(last.estimate.residual_mg, 3) if known else None,
+        "samples": len(log),
+        "samples_learnt": log.learnt,
+    }
+
+
+def scores(
+    log: CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None
+) -> tuple[Result | None, Result | None]:
+    """Heading errors against the reference with everything known, and with what an upload of offsets would give.
+
+    All are made on the same samples. (None, None) where there is nothing to compare with. Without any position the
+    declination is not known; then magnetic headings are compared, and the reference's name says so.
+    """
+    if reference is None or log.last is None:
+        return None, None
+    declination = np.array(log.declination_rad)
+    magnetic = not np.isfinite(declination).any()
+    if magnetic:
+        reference = replace(reference, name=f"{reference.name}, taken as magnetic (declination not known)")
+        declination = np.zeros(len(log))
+    unknown = ~np.isfinite(declination)
+    measured_s = np.array(log.boot_s) - np.array(log.age_s)
+    sensor, offsets = (np.array(column).reshape(-1, 3) for column in (log.sensor_b_mg, log.offsets_b_mg))
+    matrix = vehicle.calibrations.shaping(log.last.compass).matrix
+    window, left_out = Window(), {"declination not known": unknown}
+    if learn_for_s is not None:
+        window = _after(vehicle, learn_for_s)
+        offsets = log.last.offsets_mg
+    else:
+        left_out["no heading"] = ~np.isfinite(log.magnetic_rad if magnetic else log.true_rad)
+    calibrations = {
+        "full": Calibration(log.last.estimate.hard_iron_b_mg, matrix),
+        "offsets": Calibration(-offsets, matrix),
+    }
+    stored = vehicle.calibrations.offsets(log.last.compass)
+    if stored is not None:
+        calibrations["stored"] = Calibration(-stored, matrix)
+    got = score_freeze(
+        measured_s, sensor, calibrations, np.where(unknown, 0.0, declination), reference, window, left_out
+    )
+    if learn_for_s is None:
+        live = log.magnetic_rad if magnetic else log.true_rad
+        stream = log.stored_magnetic_rad if magnetic else log.stored_true_rad
+        got |= score_headings(np.array(log.boot_s), {"full": live, "stored": stream}, reference)
+    return _entry(got["full"], got, log), _entry(got["offsets"], got, log)
+
+
+def _after(vehicle: Vehicle, learn_for_s: float) -> Window:
+    """The rest of the flight once the calibration is frozen."""
+    started, crash = vehicle.started_ns(), vehicle.phase.crash_ns
+    begin = math.inf if started is None else started / 1e9 + learn_for_s
+    return Window(from_s=begin, crash_s=math.inf if crash is None else crash / 1e9)
+
+
+def _entry(main: HeadingScore, got: dict[str, HeadingScore], log: CompassLog) -> Result:
+    sigma = np.array(log.sigma_rad)
+    sigma = sigma[np.isfinite(sigma)]
+    return {
+        "reference": main.reference,
+        "rms_deg": main.rms_deg,
+        "p95_deg": main.p95_deg,
+        "bias_deg": main.bias_deg,
+        "uncalibrated_rms_deg": got["uncalibrated"].rms_deg,
+        "stored_rms_deg": got["stored"].rms_deg if "stored" in got else None,
+        "sigma_deg": math.degrees(float(np.median(sigma))) if len(sigma) else None,
+        "n": main.n,
+        "from_s": main.from_s,
+        "to_s": main.to_s,
+        "excluded": main.excluded,
+    }

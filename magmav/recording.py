@@ -1,0 +1,121 @@
+"""A recording through the same pipeline: what the service would have known, and how good it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magmav.appraisal import CompassLog, describe
+from magmav.core.types import AttitudeReading, FieldModel, Reading, Record
+from magmav.link import Link
+from magmav.pipeline import Pipeline
+from magmav.reference import Reference
+from magmav.service import Service, Watcher
+from magmav.settings import Settings
+from magmav.vehicle import Vehicle
+
+Result = dict[str, Any]
+
+
+class NothingToLearnFrom(Exception):
+    """A recording without the messages that are needed; the text says which and what was found instead."""
+
+
+class Keeper:
+    """Watches a run and keeps what a score needs."""
+
+    def __init__(self, pipeline: Pipeline, learn_for_s: float | None) -> None:
+        self._pipeline = pipeline
+        self._learn_for_s = learn_for_s
+        self.compasses: dict[tuple[int, int], CompassLog] = {}
+        self.attitudes: dict[int, list[AttitudeReading]] = {}
+        self.flags: dict[int, list[tuple[bool, bool]]] = {}
+        self._reboots: dict[int, int] = {}
+
+    def __call__(self, reading: Reading, record: Record | None) -> None:
+        """Take one reading and the Record it led to."""
+        vehicle = self._pipeline.vehicles[reading.system]
+        vehicle.learn_for_s = self._learn_for_s
+        if vehicle.assembler.reboots != self._reboots.setdefault(reading.system, 0):
+            self._forget(reading.system, vehicle.assembler.reboots)
+        if isinstance(reading, AttitudeReading):
+            self._attitude(reading, vehicle)
+        elif record is not None:
+            self._record(record, vehicle)
+
+    def _attitude(self, r: AttitudeReading, vehicle: Vehicle) -> None:
+        kept = self.attitudes.setdefault(r.system, [])
+        if kept and (r.source != kept[0].source or r.boot_ns <= kept[-1].boot_ns):
+            return
+        kept.append(r)
+        flags = (vehicle.phase.armed, vehicle.phase.aloft(r.boot_ns))
+        self.flags.setdefault(r.system, []).append(flags if vehicle.phase.flyer else (True, True))
+
+    def _record(self, record: Record, vehicle: Vehicle) -> None:
+        log = self.compasses.setdefault((record.system, record.compass), CompassLog())
+        log.add(record, vehicle.calibrations.shaping(record.compass))
+
+    def _forget(self, system: int, reboots: int) -> None:
+        self._reboots[system] = reboots
+        self.attitudes.pop(system, None)
+        self.flags.pop(system, None)
+        for key in [k for k in self.compasses if k[0] == system]:
+            del self.compasses[key]
+
+    def reference(self, system: int, truth: Reference | None) -> Reference | None:
+        """The truth file, or else the vehicle's own attitude over time; with the vehicle's phases of flight."""
+        kept = self.attitudes.get(system, [])
+        reference = truth
+        if reference is None and kept:
+            reference = Reference.from_attitude(kept, f"{kept[0].source} yaw")
+        flags = np.array(self.flags.get(system, []), dtype=bool)
+        if reference is None or flags.all():
+            return reference
+        times = [r.boot_ns / 1e9 for r in kept]
+        return reference.with_flags(times, flags[:, 0], flags[:, 1])
+
+
+def replay(
+    link: Link,
+    settings: Settings,
+    model: FieldModel,
+    *,
+    source: str,
+    learn_for_s: float | None = None,
+    reference_csv: Path | None = None,
+    watchers: Sequence[Watcher] = (),
+    references: dict[int, Reference] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Result:
+    """Run a recording to its end; the result is the JSON document that ``magmav replay --json`` prints.
+
+    references : filled with what each system was scored against, for pictures.
+    Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
+    """
+    truth = None if reference_csv is None else Reference.from_csv(reference_csv)
+    pipeline = Pipeline(settings, model, link.unix_offset_ns)
+    keeper = Keeper(pipeline, learn_for_s)
+    service = Service(link, pipeline, watchers=(keeper, *watchers))
+    service.run(stop)
+    if not keeper.compasses:
+        found = ", ".join(f"{n} {k}" for k, n in service.heard.most_common(6)) or "no message at all"
+        raise NothingToLearnFrom(
+            f"{source}: no magnetometer data with a known tilt in it (found {found}); "
+            "record RAW_IMU or SCALED_IMU together with ATTITUDE"
+        )
+    vehicles = []
+    for system in sorted({s for s, _ in keeper.compasses}):
+        vehicle = pipeline.vehicles[system]
+        reference = keeper.reference(system, truth)
+        if references is not None and reference is not None:
+            references[system] = reference
+        compasses = [
+            describe(log, vehicle, reference, learn_for_s)
+            for (s, _), log in sorted(keeper.compasses.items())
+            if s == system
+        ]
+        vehicles.append({"system": system, "autopilot": vehicle.autopilot, "compasses": compasses})
+    return {"source": source, "learn_for_s": learn_for_s, "vehicles": vehicles, "counts": service.counts()}
