@@ -129,6 +129,9 @@ class MagCompanion:
         self._now_ns = now_ns
         out: list[Outgoing] = []
         if self.job is not None:
+            flown = self.flown()
+            if flown is not None:
+                flown.settle(self.job.change.compass)  # the stream jumps a moment before the echo says so
             out += self.job.poll(now_ns)
             self._finish(self.job, now_ns)
         elif now_ns >= self._retry_ns:

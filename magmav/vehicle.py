@@ -100,7 +100,7 @@ class Vehicle:
                 self.phase.landed(r)
             case ParamReading():
                 for compass in self.calibrations.param(r):
-                    self._settle(compass)
+                    self.settle(compass)
             case ThrottleReading():
                 self.calibrations.throttle(r.share)
             case CurrentReading():
@@ -181,7 +181,8 @@ class Vehicle:
             self.channels[compass] = Channel(make, limits(self.settings), self.settings.gate.steady_s)
         return self.channels[compass]
 
-    def _settle(self, compass: int) -> None:
+    def settle(self, compass: int) -> None:
+        """What comes now and for a moment teaches nothing: this compass's correction is changing."""
         until = self._now_ns() + int(self.settings.learn.settle_s * 1e9)
         self._settle_until_ns[compass] = until
 
