@@ -153,6 +153,8 @@ class Vehicle:
 
     def _to_store(self, compass: int, finding: Finding) -> Vec3:
         """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4)."""
+        if AxisState.NOT_OBSERVED not in finding.verdict.axes:
+            return finding.offsets_mg
         stored = self.calibrations.offsets(compass)
         unknown = [axis is AxisState.NOT_OBSERVED for axis in finding.verdict.axes]
         return vec3(np.where(unknown, ZERO3 if stored is None else stored, finding.offsets_mg), "offsets")

@@ -28,7 +28,7 @@ def resting_force(roll, pitch):
 
 def test_nothing_heard_nothing_known():
     assert Motion().at(5 * MS) is None
-    assert Motion().rate_at(5 * MS) == 0.0
+    assert Motion().rate_rads == 0.0
 
 
 def test_tilt_is_carried_on_by_the_rates():
@@ -39,7 +39,7 @@ def test_tilt_is_carried_on_by_the_rates():
     assert state.roll_rad == pytest.approx(0.1 + 0.2 * 0.3)
     assert state.pitch_rad == pytest.approx(-0.1 * math.cos(0.1) * 0.3)
     assert state.source == "ATTITUDE"
-    assert m.rate_at(1300 * MS) == pytest.approx(math.hypot(0.2, 0.1))
+    assert m.rate_rads == pytest.approx(math.hypot(0.2, 0.1))
 
 
 def test_an_attitude_is_not_used_beyond_600_ms():

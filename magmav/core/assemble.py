@@ -144,8 +144,7 @@ class Assembler:
         known = self._source(reading)
         if known is None:
             return None
-        turning = self.motion.rate_at(reading.boot_ns)
-        known.turned_rad += turning * max(reading.boot_ns - known.heard_ns, 0) / 1e9
+        known.turned_rad += self.motion.rate_rads * max(reading.boot_ns - known.heard_ns, 0) / 1e9
         if reading.boot_ns > known.heard_ns:
             known.pace(reading.boot_ns, fresh=False)
         known.heard_ns = reading.boot_ns
@@ -155,7 +154,8 @@ class Assembler:
         if known.sent_b_mg is not None:
             known.pace(reading.boot_ns, fresh=True)
         age_s = known.age_s
-        state, now = self.motion.at(reading.boot_ns - round(age_s * 1e9)), self.motion.at(reading.boot_ns)
+        now = self.motion.at(reading.boot_ns)
+        state = self.motion.at(reading.boot_ns - round(age_s * 1e9)) if age_s else now
         if state is None or now is None:
             self.counts["mag: no tilt yet"] += 1
             return None

@@ -73,10 +73,11 @@ class Motion:
         else:
             self._own.step(r)
 
-    def rate_at(self, boot_ns: int) -> float:
-        """Length of the body rate, rad/s, 0 when nothing is known."""
-        state = self.at(boot_ns)
-        return 0.0 if state is None else math.hypot(*state.rate_b_rads)
+    @property
+    def rate_rads(self) -> float:
+        """Length of the newest body rate, rad/s, 0 when nothing is known."""
+        a = self._att
+        return math.hypot(*(self._own.rate_b_rads if a is None else a.rate_b_rads))
 
     def at(self, boot_ns: int) -> MotionState | None:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
@@ -101,7 +102,7 @@ class _OwnTilt:
         self._down_b = np.zeros(3)
         self._boot_ns: int | None = None
         self._source = ""
-        self._rate_b: Vec3 = ZERO3
+        self.rate_b_rads: Vec3 = ZERO3
         self._yaw_rad = 0.0
         self._epoch = 1
 
@@ -109,7 +110,7 @@ class _OwnTilt:
         """Start from the autopilot's tilt, should its attitudes end here."""
         if a.boot_ns != self._boot_ns:
             self._down_b = level_from_body(a.roll_rad, a.pitch_rad)[2]
-            self._boot_ns, self._rate_b = a.boot_ns, a.rate_b_rads
+            self._boot_ns, self.rate_b_rads = a.boot_ns, a.rate_b_rads
 
     def step(self, r: InertialReading) -> None:
         """Propagate by the gyro, pull towards the accelerometer's down while nothing else accelerates."""
@@ -127,13 +128,13 @@ class _OwnTilt:
             self._epoch += 2
         else:
             roll, pitch = self._tilt()
-            self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self._rate_b + r.rate_b_rads))[2] * dt
-            x, y, z = 0.5 * (self._rate_b + r.rate_b_rads) * dt
+            self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self.rate_b_rads + r.rate_b_rads))[2] * dt
+            x, y, z = 0.5 * (self.rate_b_rads + r.rate_b_rads) * dt
             moved = self._down_b - np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._down_b
             trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
             moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
             self._down_b = moved / np.linalg.norm(moved)
-        self._boot_ns, self._rate_b = r.boot_ns, r.rate_b_rads
+        self._boot_ns, self.rate_b_rads = r.boot_ns, r.rate_b_rads
 
     def _tilt(self) -> tuple[float, float]:
         return tilt_from_force(-self._down_b) or (0.0, 0.0)
@@ -144,6 +145,6 @@ class _OwnTilt:
             return None
         age = (boot_ns - self._boot_ns) / 1e9
         roll, pitch = self._tilt()
-        dr, dp, dy = euler_rates(roll, pitch, self._rate_b)
+        dr, dp, dy = euler_rates(roll, pitch, self.rate_b_rads)
         yaw = self._yaw_rad + dy * age
-        return MotionState(roll + dr * age, pitch + dp * age, yaw, self._rate_b, "OWN", self._epoch, False)
+        return MotionState(roll + dr * age, pitch + dp * age, yaw, self.rate_b_rads, "OWN", self._epoch, False)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import predict, update
@@ -59,6 +60,25 @@ class Noise:
     change_hold_s: float = 3.0
 
 
+class _Way(NamedTuple):
+    """From the last sample that taught to this one: time, turn, the turn's variance, and whether it is lost."""
+
+    dt_s: float
+    turn_rad: float
+    turn_rad2: float
+    lost: bool
+
+    def after(self, s: Sample, n: Noise) -> _Way:
+        """The same and one sample more."""
+        dt = max(s.dt_s, 0.0)
+        walk = n.gyro_walk_rad if s.tilt_from == "ATTITUDE" else n.own_gyro_walk_rad
+        variance = walk**2 * dt + (n.gyro_scale * s.yaw_step_rad) ** 2
+        return _Way(self.dt_s + dt, self.turn_rad + s.yaw_step_rad, self.turn_rad2 + variance, self.lost or s.gap)
+
+
+_STILL = _Way(0.0, 0.0, 0.0, False)
+
+
 class KalmanEstimator:
     """One compass's filter. ``noise`` holds every number that was chosen."""
 
@@ -69,6 +89,7 @@ class KalmanEstimator:
         self._P: Array = np.diag(
             [n.prior_iron_mg**2] * 3 + [n.prior_field_mg**2] * 3 + [n.disturbance_mg**2] * 3 + [n.delay_s**2]
         ).astype(np.float64)
+        self._idle = _STILL  # time that taught nothing is made up for when something does again
         self._samples = 0
         self._nis_sum = 0.0  # clipped NIS per axis, and how many
         self._recent_nis = 1.0
@@ -80,36 +101,36 @@ class KalmanEstimator:
 
     def step(self, sample: Sample) -> None:
         """Carry the state to this sample's time and, where the time teaches, learn from it."""
-        self._turn(sample)
-        if sample.learn:
-            self._learn(sample)
+        self._since_change_s += max(sample.dt_s, 0.0)
+        if not sample.learn:
+            self._idle = self._idle.after(sample, self.noise)
+            return
+        self._turn(self._idle.after(sample, self.noise))
+        self._idle = _STILL
+        self._learn(sample)
 
     # ------------------------------------------------------------ process
 
-    def _turn(self, s: Sample) -> None:
+    def _turn(self, way: _Way) -> None:
         n = self.noise
-        dt = max(s.dt_s, 0.0)
-        fade = math.exp(-dt / n.disturbance_tau_s)
+        fade = math.exp(-way.dt_s / n.disturbance_tau_s)
         F = _EYE.copy()
         F[6, 6] = F[7, 7] = F[8, 8] = fade
-        c, si = math.cos(s.yaw_step_rad), math.sin(s.yaw_step_rad)
+        c, si = math.cos(way.turn_rad), math.sin(way.turn_rad)
         F[3:5, 3:5] = ((c, si), (-si, c))
         Q = np.zeros((_SIZE, _SIZE))
-        Q.flat[_B_DIAGONAL] = n.iron_walk_mg**2 * dt
+        Q.flat[_B_DIAGONAL] = n.iron_walk_mg**2 * way.dt_s
         Q.flat[_D_DIAGONAL] = n.disturbance_mg**2 * (1.0 - fade * fade)
-        Q[_T, _T] = n.delay_walk_s**2 * dt
-        if s.gap:
+        Q[_T, _T] = n.delay_walk_s**2 * way.dt_s
+        if way.lost:
             # Nobody knows how far the vehicle turned: the horizontal field may point anywhere.
             self._forget_direction(F)
         else:
-            walk = n.gyro_walk_rad if s.tilt_from == "ATTITUDE" else n.own_gyro_walk_rad
-            turn2 = walk**2 * dt + (n.gyro_scale * s.yaw_step_rad) ** 2
             ahead, right = F[3:5, 3:5] @ self._x[3:5]
             along = np.array((right, -ahead))
             unsure = (self._P[3, 3] + self._P[4, 4]) / 2.0
-            Q[3:5, 3:5] = turn2 * (along[:, None] * along + ((unsure, 0.0), (0.0, unsure)))
+            Q[3:5, 3:5] = way.turn_rad2 * (along[:, None] * along + ((unsure, 0.0), (0.0, unsure)))
         self._x, self._P = predict(self._x, self._P, F, Q)
-        self._since_change_s += dt
 
     def _forget_direction(self, F: Array) -> None:
         prior = self.noise.prior_field_mg**2
