@@ -51,6 +51,8 @@ class Noise:
     gyro_walk_rad: float = math.radians(0.15)  # per square root of a second
     own_gyro_walk_rad: float = math.radians(0.6)  # the same for a gyro nobody has corrected
     gyro_scale: float = 0.01
+    least_tilt_rad: float = math.radians(2.0)  # RMS per axis; tilting less than this may be the attitude's own noise
+    tilt_memory_s: float = 30.0
     outlier_nis: float = 16.0  # beyond this (3 degrees of freedom) a reading is trusted less, not thrown away
     model_mg: float = 8.0  # world model against the real local field
     factor_lo: float = 0.25  # bounds of the common factor on all sigmas, squared
@@ -79,6 +81,37 @@ class _Way(NamedTuple):
 _STILL = _Way(0.0, 0.0, 0.0, False)
 
 
+class _Tilt:
+    """Calms the tilt: what may be nothing but the attitude's own noise must not count as tilting.
+
+    A noisy regressor makes a regression see too little of what it multiplies, and too sure of it: a level rover with
+    0.3 degrees of noise "proved" its down axis 430 mG wrong. While the vehicle tilts less than noise might, its tilt is
+    taken to be the slow mean and the difference counts as error of the reading. A share of the tilt would bias the
+    down axis the other way wherever the attitude is better than feared (SITL: 14 mG).
+    """
+
+    def __init__(self) -> None:
+        self._mean_b: tuple[float, float, float] | None = None  # of the down direction
+        self._variance_rad2 = 0.0
+
+    def calmed(self, s: Sample, n: Noise) -> tuple[float, float, float]:
+        """Roll and pitch to reckon with, and the angle that was taken away, rad."""
+        cp = math.cos(s.pitch_rad)
+        down = (-math.sin(s.pitch_rad), math.sin(s.roll_rad) * cp, math.cos(s.roll_rad) * cp)
+        if self._mean_b is None:
+            self._mean_b = down
+        weight = min(max(s.dt_s, 0.0) / n.tilt_memory_s, 0.2)
+        mean = self._mean_b
+        away = (down[0] - mean[0], down[1] - mean[1], down[2] - mean[2])
+        off = math.hypot(*away)
+        self._mean_b = (mean[0] + weight * away[0], mean[1] + weight * away[1], mean[2] + weight * away[2])
+        self._variance_rad2 += weight * (off * off - self._variance_rad2)
+        if self._variance_rad2 > 2.0 * n.least_tilt_rad**2:
+            return s.roll_rad, s.pitch_rad, 0.0
+        x, y, z = self._mean_b
+        return math.atan2(y, z), math.atan2(-x, math.hypot(y, z)), off
+
+
 class KalmanEstimator:
     """One compass's filter. ``noise`` holds every number that was chosen."""
 
@@ -90,6 +123,7 @@ class KalmanEstimator:
             [n.prior_iron_mg**2] * 3 + [n.prior_field_mg**2] * 3 + [n.disturbance_mg**2] * 3 + [n.delay_s**2]
         ).astype(np.float64)
         self._idle = _STILL  # time that taught nothing is made up for when something does again
+        self._tilt = _Tilt()
         self._samples = 0
         self._nis_sum = 0.0  # clipped NIS per axis, and how many
         self._recent_nis = 1.0
@@ -145,13 +179,14 @@ class KalmanEstimator:
 
     def _learn(self, s: Sample) -> None:
         n = self.noise
-        body_from_level = level_from_body(s.roll_rad, s.pitch_rad).T
+        roll, pitch, removed = self._tilt.calmed(s, n)
+        body_from_level = level_from_body(roll, pitch).T
         level_field = self._x[_H] + self._x[_D]
         predicted, H = measurement(s, body_from_level, self._x[_B], level_field, float(self._x[_T]))
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
         total = min(max(math.hypot(*self._x[_H]), 200.0), 700.0)
         smear = n.sync_s * math.hypot(*s.rate_b_rads) * total
-        R = _EYE3 * (n.reading_mg**2 + smear * smear)
+        R = _EYE3 * (n.reading_mg**2 + smear * smear + (removed * total) ** 2)
         innovation = z - predicted
         S = H @ self._P @ H.T + R
         nis = float(innovation @ np.linalg.solve(S, innovation))
