@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magmav.core.types import Heading, Record, Shaping, State
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
-from magmav.vehicle import Vehicle
+from magmav.vehicle import Boot, Vehicle
 
 Result = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -73,7 +73,9 @@ def _angles(heading: Heading) -> tuple[float, float]:
     return magnetic, heading.true_rad if heading.true_valid else math.nan
 
 
-def describe(log: CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None) -> Result:
+def describe(
+    log: CompassLog, vehicle: Vehicle | Boot, reference: Reference | None, learn_for_s: float | None
+) -> Result:
     """One compass's entry in the result. Numbers that are not known are None. ValueError for an empty log."""
     last = log.last
     if last is None:
@@ -106,7 +108,7 @@ def describe(log: CompassLog, vehicle: Vehicle, reference: Reference | None, lea
 
 
 def scores(
-    log: CompassLog, vehicle: Vehicle, reference: Reference | None, learn_for_s: float | None
+    log: CompassLog, vehicle: Vehicle | Boot, reference: Reference | None, learn_for_s: float | None
 ) -> tuple[Result | None, Result | None]:
     """Heading errors against the reference with everything known, and with what an upload of offsets would give.
 
@@ -147,7 +149,7 @@ def scores(
     return _entry(got["full"], got, log), _entry(got["offsets"], got, log)
 
 
-def _after(vehicle: Vehicle, learn_for_s: float) -> Window:
+def _after(vehicle: Vehicle | Boot, learn_for_s: float) -> Window:
     """The rest of the flight once the calibration is frozen."""
     started, crash = vehicle.started_ns(), vehicle.phase.crash_ns
     begin = math.inf if started is None else started / 1e9 + learn_for_s

@@ -184,7 +184,8 @@ def run(o: argparse.Namespace) -> int:
             watchers.append(lambda reading, record: None if record is None else writer.write(record))
         session = Session.on(link, settings, world_magnetic_model, store, watchers)
         _warn(link)
-        _log.warning("listening on %s; stop with Ctrl-C", link.name)
+        port = getattr(link, "port", None)
+        _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {port})" if port else "")
         until = _Deadline(o.for_s)
         session.service.run(lambda: stopped() or until(session.service.now_ns))
     return 0
@@ -326,7 +327,11 @@ def demo(o: argparse.Namespace) -> int:
         )
         if o.out is None:
             result["folder"] = None
+        else:
+            (o.out / "demo.json").write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
     _show(o, result, demo_view)
+    if not o.json:
+        sys.stdout.write(json.dumps(finite(result)) + "\n")
     good = result["upload"]["result"] == "ALL_NEW" and result["restore"]["result"] == "ALL_OLD"
     return 0 if good else 1
 

@@ -54,9 +54,17 @@ class MagCompanion:
     """Serves one vehicle. ``job`` is the write under way; ``ended`` the last one that came to an end."""
 
     def __init__(
-        self, settings: Settings, pipeline: Pipeline, store: Store, unix_offset_ns: int, *, ask: bool = True
+        self,
+        settings: Settings,
+        pipeline: Pipeline,
+        store: Store,
+        unix_offset_ns: int,
+        *,
+        ask: bool = True,
+        serves: bool = True,
     ) -> None:
         self.settings = settings
+        self._serves = serves  # False: one write of the caller's and nothing else, no trigger and no pending restore
         self.confirm = 0.0
         self.result = 0.0
         self.job: Upload | None = None
@@ -69,6 +77,7 @@ class MagCompanion:
         self._records: dict[int, Record] = {}
         self._states: dict[int, State] = {}
         self._saved_ns: dict[int, int] = {}
+        self._said_ambiguous = False
         self._retry_ns = 0
         self._restoring: int | None = None
         self._left_alone: set[int] = set()
@@ -127,6 +136,9 @@ class MagCompanion:
     def poll(self, now_ns: int) -> list[Outgoing]:
         """What is due from every machine, the write under way first."""
         self._now_ns = now_ns
+        if self.presence.ambiguous and not self._said_ambiguous:
+            self._said_ambiguous = True
+            _log.warning("several vehicles %s; choose one with --system ID", self.presence.ambiguous)
         out: list[Outgoing] = []
         if self.job is not None:
             flown = self.flown()
@@ -134,7 +146,7 @@ class MagCompanion:
                 flown.settle(self.job.change.compass)  # the stream jumps a moment before the echo says so
             out += self.job.poll(now_ns)
             self._finish(self.job, now_ns)
-        elif now_ns >= self._retry_ns:
+        elif self._serves and now_ns >= self._retry_ns:
             self._restore_pending(now_ns)
         for machine in (self.presence, self._intervals, self._fetch):
             out += machine.poll(now_ns)
@@ -143,7 +155,8 @@ class MagCompanion:
     def _counted(self, out: list[Outgoing], now_ns: int) -> list[Outgoing]:
         """What must go out at once is paid back by what can wait: the whole stays in the budget (AT-9c)."""
         for message, _ in out:
-            self._budget.force(message, now_ns)
+            if message.get_type() != "PING":  # as often as somebody asks; must not silence all else
+                self._budget.force(message, now_ns)
         return out
 
     def leave(self, now_ns: int) -> list[Outgoing]:
@@ -178,7 +191,7 @@ class MagCompanion:
         """Upload what is known now, if the gate says it may be."""
         record = self.record(compass, now_ns)
         change = self.plan(compass)
-        if self.job is not None:
+        if self.job is not None or not self._serves:
             self._refuse(Reason.BUSY, now_ns)
         elif record is None or record.verdict.state is not State.READY:
             self._refuse(Reason.NO_CALIBRATION, now_ns)
@@ -192,7 +205,7 @@ class MagCompanion:
         flown = self.flown()
         device = 0 if flown is None else flown.calibrations.device_id(compass)
         row = self._store.last_restorable(self.presence.system, compass, device)
-        if self.job is not None:
+        if self.job is not None or not self._serves:
             self._refuse(Reason.BUSY, now_ns)
         elif row is None:
             self._refuse(Reason.NO_SNAPSHOT, now_ns)
@@ -215,7 +228,9 @@ class MagCompanion:
         return plan_change(flown.calibrations, self.presence.system, compass, iron, record.sigma_mg, (x, y, z))
 
     def start(self, change: Change, confirm: int | None, now_ns: int, undoes: int | None = None) -> None:
-        """Begin a write; its messages come out of poll."""
+        """Begin a write; its messages come out of poll. ValueError while another one runs."""
+        if self.job is not None:
+            raise ValueError("start: a write is under way; wait for its end")
         limits = UploadSettings(confirm_above_mg=self.settings.upload.confirm_above_mg)
         self.refusal = None
         self.job = Upload(
@@ -263,7 +278,8 @@ class MagCompanion:
 
     def _refuse(self, reason: Reason, now_ns: int) -> None:
         self.refusal = reason
-        self.result = -float(reason.number)
+        if self.job is None:  # while a write runs, the result is that it runs
+            self.result = -float(reason.number)
         self.announcer.say(_WARNING, f"MMAG refused: {reason.text}", now_ns)
 
     def _restore_pending(self, now_ns: int) -> None:

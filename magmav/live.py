@@ -46,9 +46,13 @@ class Session:
         *,
         ask: bool = True,
     ) -> Session:
-        """Build pipeline, companion and service for a link. ``ask``: request message rates from the start."""
+        """Build pipeline, companion and service for a link.
+
+        ask : the long-running service: requests message rates, obeys triggers, restores what was cut short. False for
+        one write and nothing else.
+        """
         pipeline = Pipeline(settings, model, link.unix_offset_ns)
-        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns, ask=ask)
+        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns, ask=ask, serves=ask)
         return cls(Service(link, pipeline, companion, watchers), companion, pipeline)
 
 

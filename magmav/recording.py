@@ -15,13 +15,18 @@ from magmav.pipeline import Pipeline
 from magmav.reference import Reference
 from magmav.service import Service, Watcher
 from magmav.settings import Settings
-from magmav.vehicle import Vehicle
+from magmav.vehicle import Boot, Vehicle
 
 Result = dict[str, Any]
 
 
 class NothingToLearnFrom(Exception):
     """A recording without the messages that are needed; the text says which and what was found instead."""
+
+
+_Past = tuple[
+    dict[tuple[int, int], CompassLog], list[AttitudeReading], list[tuple[bool, bool]], Boot | None
+]  # one boot: per compass, attitudes and their flags, and what the vehicle held
 
 
 class Keeper:
@@ -34,13 +39,15 @@ class Keeper:
         self.attitudes: dict[int, list[AttitudeReading]] = {}
         self.flags: dict[int, list[tuple[bool, bool]]] = {}
         self._reboots: dict[int, int] = {}
+        self._past: dict[int, _Past] = {}
 
     def __call__(self, reading: Reading, record: Record | None) -> None:
         """Take one reading and the Record it led to."""
         vehicle = self._pipeline.vehicles[reading.system]
         vehicle.learn_for_s = self._learn_for_s
         if vehicle.assembler.reboots != self._reboots.setdefault(reading.system, 0):
-            self._forget(reading.system, vehicle.assembler.reboots)
+            self._reboots[reading.system] = vehicle.assembler.reboots
+            self._put_away(reading.system, vehicle.former)
         if isinstance(reading, AttitudeReading):
             self._attitude(reading, vehicle)
         elif record is not None:
@@ -58,12 +65,24 @@ class Keeper:
         log = self.compasses.setdefault((record.system, record.compass), CompassLog())
         log.add(record, vehicle.calibrations.shaping(record.compass))
 
-    def _forget(self, system: int, reboots: int) -> None:
-        self._reboots[system] = reboots
-        self.attitudes.pop(system, None)
-        self.flags.pop(system, None)
-        for key in [k for k in self.compasses if k[0] == system]:
-            del self.compasses[key]
+    def _put_away(self, system: int, boot: Boot | None) -> None:
+        """The vehicle rebooted: boot times begin again. A boot that taught something is kept until another one does."""
+        logs = {key: self.compasses.pop(key) for key in [k for k in self.compasses if k[0] == system]}
+        past = (logs, self.attitudes.pop(system, []), self.flags.pop(system, []), boot)
+        if boot is not None and any(log.learnt for log in logs.values()):
+            self._past[system] = past
+
+    def bring_back(self) -> dict[int, Boot]:
+        """At the end: where the last boot taught nothing, the last one that did. Systems it was done for."""
+        out = {}
+        for system, (logs, attitudes, flags, boot) in self._past.items():
+            if boot is None or any(log.learnt for key, log in self.compasses.items() if key[0] == system):
+                continue
+            for key in [k for k in self.compasses if k[0] == system]:
+                del self.compasses[key]
+            self.compasses |= logs
+            self.attitudes[system], self.flags[system], out[system] = attitudes, flags, boot
+        return out
 
     def reference(self, system: int, truth: Reference | None) -> Reference | None:
         """The truth file, or else the vehicle's own attitude over time; with the vehicle's phases of flight."""
@@ -100,6 +119,7 @@ def replay(
     keeper = Keeper(pipeline, learn_for_s)
     service = Service(link, pipeline, watchers=(keeper, *watchers))
     service.run(stop)
+    earlier = keeper.bring_back()
     if not keeper.compasses:
         found = ", ".join(f"{n} {k}" for k, n in service.heard.most_common(6)) or "no message at all"
         raise NothingToLearnFrom(
@@ -112,10 +132,12 @@ def replay(
         reference = keeper.reference(system, truth)
         if references is not None and reference is not None:
             references[system] = reference
+        boot = earlier.get(system, vehicle)
         compasses = [
-            describe(log, vehicle, reference, learn_for_s)
+            describe(log, boot, reference, learn_for_s)
             for (s, _), log in sorted(keeper.compasses.items())
             if s == system
         ]
-        vehicles.append({"system": system, "autopilot": vehicle.autopilot, "compasses": compasses})
+        facts = {"system": system, "autopilot": vehicle.autopilot, "reboots": vehicle.assembler.reboots}
+        vehicles.append(facts | {"compasses": compasses})
     return {"source": source, "learn_for_s": learn_for_s, "vehicles": vehicles, "counts": service.counts()}

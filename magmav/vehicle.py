@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -46,6 +46,19 @@ _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is st
 _SAY_FROZEN_NS = 1_000_000_000
 
 
+@dataclass(frozen=True, slots=True)
+class Boot:
+    """What stays of the vehicle's time before a reboot: enough to judge what was learnt then."""
+
+    calibrations: Calibrations
+    phase: Phase
+    began_ns: int | None
+
+    def started_ns(self) -> int | None:
+        """Boot time of take-off, or of the first data where nothing flew."""
+        return self.began_ns
+
+
 class Vehicle:
     """One vehicle: what it says of itself, and one channel per compass."""
 
@@ -58,6 +71,7 @@ class Vehicle:
         self.assembler = Assembler(system)
         self.phase = Phase()
         self.calibrations = Calibrations()
+        self.former: Boot | None = None
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[str] = Counter()
         self._keeper = FieldKeeper(model)
@@ -113,14 +127,14 @@ class Vehicle:
     def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
         held, compass = self.calibrations, r.compass
         channel = self._channel(compass)
-        if held.epoch(compass) != self._epochs.get(compass):
+        channel.held = not self.learning or self._over(r.boot_ns)
+        if held.epoch(compass) != self._epochs.get(compass) and not channel.keeps:
             self._epochs[compass] = held.epoch(compass)
             self.assembler.restart(compass)
             channel.restart()
         if not held.undoable(compass):
             self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
             return None
-        channel.held = not self.learning or self._over(r.boot_ns)
         learn = self._teaches(compass, r.boot_ns) and not channel.held
         shaping = held.shaping(compass)
         sample = self.assembler.mag(r, partial(held.undo, compass), shaping, learn)
@@ -227,15 +241,18 @@ class Vehicle:
             return
         self._reboots = self.assembler.reboots
         self.counts["reboots"] += 1
+        self.former = Boot(self.calibrations, self.phase, self.started_ns())
         kind = self.phase.kind
         self.phase = Phase()
         self.phase.kind = kind
-        self.calibrations.forget()
+        self.calibrations = Calibrations()
+        self._epochs.clear()
         self._settle_until_ns.clear()
         self._latest.clear()
         self._first_ns = self._unix_minus_boot_ns = None
         for channel in self.channels.values():
-            channel.restart()
+            if not channel.keeps:
+                channel.restart()
 
 
 def limits(settings: Settings) -> gate.Limits:

@@ -176,16 +176,6 @@ def test_our_own_change_starts_no_new_epoch_but_is_undone_at_once():
     assert held.epoch(1) == before + 1
 
 
-def test_after_a_reboot_nothing_is_known():
-    held = holding(plain(ofs=(10, 20, 30)))
-    before = held.epoch(1)
-    held.forget()
-    assert held.epoch(1) > before
-    assert held.offsets(1) is None
-    assert not held.known(1)
-    assert held.undo(1, SENSOR) == pytest.approx(SENSOR)
-
-
 # ------------------------------------------------------------ absolute, relative, assumed
 
 

@@ -72,12 +72,17 @@ class Channel:
         self._make = make
         self.limits = limits
         self._steady_s = steady_s
-        self.verdict = gate.NOTHING
         self.held = False
         self.restart()
 
+    @property
+    def keeps(self) -> bool:
+        """On hold with an answer: the sensor's own iron does not change with what the autopilot stores."""
+        return self.held and self._estimate is not None
+
     def restart(self) -> None:
         """Begin again: what was learnt belongs to another stretch of data."""
+        self.verdict = gate.NOTHING
         self._estimator = self._make()
         self._excitation = Excitation()
         self._estimate: Estimate | None = None
@@ -174,10 +179,8 @@ class Channel:
         return bool((moved <= 2.0 * sigma_mg + 3.0)[:2].all())
 
     def _judge(self, s: Sample, c: Circumstances, sigma_mg: Vec3, offsets_sd: float) -> None:
-        if self.held and self.verdict is not gate.NOTHING:
-            return
         e = self._estimate
-        steady = self.verdict.state is State.READY and not s.learn
+        steady = self.held or (self.verdict.state is State.READY and not s.learn)
         evidence = gate.Evidence(
             estimate=e,
             expected=c.expected,

@@ -145,8 +145,11 @@ class ParamServer:
             error = _RANGE
         elif entry.trigger:
             error = None if exactly_us else _DENIED
-            if exactly_us and not self._is_repeat(entry.name, value, now_ns) and entry.set(value, now_ns):
-                self._triggered[entry.name] = value, now_ns
+            if exactly_us and not self._is_repeat(entry.name, value, now_ns):
+                if entry.set(value, now_ns):
+                    self._triggered[entry.name] = value, now_ns
+                else:
+                    error = _RANGE
         elif entry.set(value, now_ns):
             self._triggered.clear()  # a new setting makes the same trigger a new wish
         else:

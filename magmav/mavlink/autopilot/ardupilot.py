@@ -138,14 +138,6 @@ class Calibrations:
         for name, value in zip(names, values, strict=True):
             self._expected.setdefault(name, set()).add(value)
 
-    def forget(self) -> None:
-        """The vehicle rebooted: everything must be read again."""
-        self._held.clear()
-        self._expected.clear()
-        self._forget_answers()
-        for compass in COMPASSES:
-            self._epoch[compass] += 1
-
     def known(self, compass: int) -> bool:
         """True when stored offsets and device id were heard, so that results are absolute."""
         return self._answer("known", compass, self._is_known)
