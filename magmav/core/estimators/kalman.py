@@ -93,6 +93,7 @@ class _Tilt:
     def __init__(self) -> None:
         self._mean_b: tuple[float, float, float] | None = None  # of the down direction
         self._variance_rad2 = 0.0
+        self._n = 0
 
     def calmed(self, s: Sample, n: Noise) -> tuple[float, float, float]:
         """Roll and pitch to reckon with, and the angle that was taken away, rad."""
@@ -100,13 +101,14 @@ class _Tilt:
         down = (-math.sin(s.pitch_rad), math.sin(s.roll_rad) * cp, math.cos(s.roll_rad) * cp)
         if self._mean_b is None:
             self._mean_b = down
-        weight = min(max(s.dt_s, 0.0) / n.tilt_memory_s, 0.2)
+        self._n += 1
+        weight = max(min(max(s.dt_s, 0.0) / n.tilt_memory_s, 0.2), 1.0 / self._n)
         mean = self._mean_b
         away = (down[0] - mean[0], down[1] - mean[1], down[2] - mean[2])
         off = math.hypot(*away)
         self._mean_b = (mean[0] + weight * away[0], mean[1] + weight * away[1], mean[2] + weight * away[2])
         self._variance_rad2 += weight * (off * off - self._variance_rad2)
-        if self._variance_rad2 > 2.0 * n.least_tilt_rad**2:
+        if self._variance_rad2 > 2.0 * n.least_tilt_rad**2 or off > 2.0 * n.least_tilt_rad:
             return s.roll_rad, s.pitch_rad, 0.0
         x, y, z = self._mean_b
         return math.atan2(y, z), math.atan2(-x, math.hypot(y, z)), off
@@ -193,7 +195,7 @@ class KalmanEstimator:
         self._judge(nis / 3.0, innovation, s.dt_s)
         limit = n.outlier_nis * self._factor()
         if nis > limit:
-            R = R + S * (nis / limit - 1.0)
+            R = R + S * ((nis / limit) ** 2 - 1.0)
         linear = innovation + H @ self._x  # filterpy subtracts H x again
         self._x, self._P = update(self._x, self._P, linear, R, H)
         self._samples += 1
