@@ -18,7 +18,7 @@ from magmav.core.types import AxisState, Sample, Shaping, mat3, vec3
 NEVER = 1e12
 PLAIN = Noise(
     sync_s=0.0, delay_s=0.0, delay_walk_s=0.0, iron_walk_mg=0.0, gyro_walk_rad=0.0, gyro_scale=0.0,
-    outlier_nis=NEVER, change_nis=NEVER, factor_lo=1.0, factor_hi=1.0, least_tilt_rad=0.0,
+    doubt_nis=NEVER, outlier_nis=NEVER, change_nis=NEVER, factor_lo=1.0, factor_hi=1.0, least_tilt_rad=0.0,
 )  # fmt: skip
 
 

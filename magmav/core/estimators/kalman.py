@@ -53,7 +53,8 @@ class Noise:
     gyro_scale: float = 0.01
     least_tilt_rad: float = math.radians(2.0)  # RMS per axis; tilting less than this may be the attitude's own noise
     tilt_memory_s: float = 30.0
-    outlier_nis: float = 16.0  # beyond this (3 degrees of freedom) a reading is trusted less, not thrown away
+    doubt_nis: float = 11.2  # beyond this (3 degrees of freedom) a reading is trusted less, not thrown away
+    outlier_nis: float = 16.0  # and it counts for no more than this in the statistics
     model_mg: float = 8.0  # world model against the real local field
     factor_lo: float = 0.25  # bounds of the common factor on all sigmas, squared
     factor_hi: float = 25.0
@@ -193,9 +194,9 @@ class KalmanEstimator:
         S = H @ self._P @ H.T + R
         nis = float(innovation @ np.linalg.solve(S, innovation))
         self._judge(nis / 3.0, innovation, s.dt_s)
-        limit = n.outlier_nis * self._factor()
+        limit = n.doubt_nis * self._factor()
         if nis > limit:
-            R = R + S * ((nis / limit) ** 2 - 1.0)
+            R = R + S * (nis / limit - 1.0)
         linear = innovation + H @ self._x  # filterpy subtracts H x again
         self._x, self._P = update(self._x, self._P, linear, R, H)
         self._samples += 1
