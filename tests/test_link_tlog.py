@@ -110,7 +110,7 @@ def test_sending_into_a_recording_is_counted_and_changes_nothing(tmp_path: Path)
     assert link.counts["not sent"] == 2 and path.read_bytes() == before
 
 
-def test_a_recording_opens_no_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_S15_a_recording_opens_no_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*args: object, **kwargs: object) -> None:
         raise AssertionError("a socket was opened")
 

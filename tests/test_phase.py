@@ -115,7 +115,7 @@ def test_what_does_not_fly_learns_wherever_it_is(kind):
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 13, 14, 15, 19, 20, 21, 22, 29])
-def test_what_flies_waits_for_it_unless_told(kind):
+def test_S10_what_flies_learns_nothing_on_the_ground_unless_told(kind):
     phase = Phase()
     beat(phase, armed=False, kind=kind)
     assert phase.flyer

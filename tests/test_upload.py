@@ -327,7 +327,7 @@ def test_no_stream_is_refused_before_anything_is_written() -> None:
     refused(rig, Reason.NO_STREAM)
 
 
-def test_wrong_vehicle_and_other_autopilots_and_no_change_are_refused_at_once() -> None:
+def test_S19_wrong_vehicle_and_other_autopilots_and_no_change_are_refused_at_once() -> None:
     refused(Rig(), Reason.WRONG_VEHICLE, change=a_change(system=2))
     refused(Rig(), Reason.NOTHING_TO_DO, change=a_change(0.0, 0.0, 0.0))
     rig = Rig()
