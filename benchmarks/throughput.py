@@ -89,7 +89,7 @@ def whole_path(stretch: Stretch) -> tuple[int, int]:
     pipeline = Pipeline(Settings(), world_magnetic_model, stretch.unix_offset_ns)
     service = Service(_Again(stretch), pipeline, watchers=[count])
     service.run()
-    return service.codec.counts["messages"] + service.codec.counts["skipped"], samples
+    return service.hearing.codec.counts["messages"] + service.hearing.codec.counts["skipped"], samples
 
 
 def bare_parse(stretch: Stretch) -> tuple[int, int]:

@@ -22,7 +22,7 @@ __version__ = "0.1.0"
 _WHERE = {
     "replay": "magmav.recording",
     "NothingToLearnFrom": "magmav.recording",
-    "open_recording": "magmav.link.tlog",
+    "open_recording": "magmav.recording",
     "Settings": "magmav.settings",
     "load_settings": "magmav.settings",
     "world_magnetic_model": "magmav.geomag",
@@ -39,7 +39,7 @@ _WHERE = {
     "RecordWriter": "magmav.view.records",
     "read_records": "magmav.view.records",
 }
-_AS = {"open_recording": "TlogLink", "load_settings": "load"}
+_AS = {"load_settings": "load"}
 
 __all__ = ["__version__", *_WHERE]
 

@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     sim.add_argument("rest", nargs=argparse.REMAINDER)
 
     replay = add("replay", "a recording through the same pipeline: what would have been known", place=True)
-    replay.add_argument("log", type=Path, metavar="LOG", help="a .tlog")
+    replay.add_argument("log", type=Path, metavar="LOG", help="a .tlog, .bin, .log or .ulg")
     replay.add_argument(
         "--learn-for", type=float, metavar="S", help="freeze S seconds after take-off and score the rest"
     )
@@ -139,6 +139,7 @@ def _guarded(options: argparse.Namespace) -> int:
 
     from magmav.demo import DemoError
     from magmav.live import NoVehicle
+    from magmav.logs import LogError
     from magmav.recording import NothingToLearnFrom
     from magmav.reference import TruthError
     from magmav.saved_result import SavedResultError
@@ -149,7 +150,7 @@ def _guarded(options: argparse.Namespace) -> int:
         result: Any = COMMANDS[options.command](options)
     except (SettingsError, ValueError) as error:
         return fail(USAGE, str(error), options.json)
-    except (NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError) as error:
+    except (LogError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError) as error:
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
         return fail(INPUT if options.command == "replay" else PORT, str(error), options.json)

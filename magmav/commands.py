@@ -93,7 +93,7 @@ def _until_signal(link: Link) -> Iterator[Callable[[], bool]]:
 
 def replay(o: argparse.Namespace) -> int:
     """A recording through the pipeline."""
-    from magmav.link.tlog import TlogLink
+    from magmav.recording import open_recording
     from magmav.recording import replay as run
     from magmav.view.records import RecordWriter
     from magmav.view.table import replay_view
@@ -106,8 +106,8 @@ def replay(o: argparse.Namespace) -> int:
     settings = _settings(o)
     with ExitStack() as stack:
         progress = _progress(stack, o.log.name)
-        link = TlogLink(o.log, progress)
-        stack.callback(link.close)
+        recording = open_recording(o.log, progress)
+        stack.callback(recording.close)
         watchers: list[Callable[[Reading, Record | None], None]] = []
         if o.records is not None:
             writer = stack.enter_context(RecordWriter(o.records))
@@ -123,7 +123,7 @@ def replay(o: argparse.Namespace) -> int:
         if timeline is not None:
             watchers.append(timeline)
         result = run(
-            link,
+            recording,
             settings,
             world_magnetic_model,
             source=str(o.log),
@@ -205,7 +205,7 @@ class _Deadline:
 
 def _live(text: str, open_link: Callable[..., Link]) -> Link:
     """A live link; a recording is no place to send anything to (S15)."""
-    if text.lower().endswith(".tlog"):
+    if text.lower().endswith((".tlog", ".bin", ".log", ".ulg")):
         raise LinkError(f"{text}: a recording is not a live link; use `magmav replay`")
     return open_link(text)
 

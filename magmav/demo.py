@@ -134,7 +134,7 @@ class Director:
         command = dialect.MAVLink_command_long_message(
             autopilot.system, autopilot.component, dialect.MAV_CMD_MISSION_START, 0, 0, 0, 0, 0, 0, 0, 0
         )
-        self._link.send(self.session.service.codec.encode(command, *_OPERATOR), autopilot.route)
+        self._link.send(self.session.service.hearing.codec.encode(command, *_OPERATOR), autopilot.route)
 
 
 def demo(

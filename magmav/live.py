@@ -111,7 +111,7 @@ def transact(
     finally:
         for message, route in companion.leave(packet.t_ns if begun_ns is not None else 0):
             with suppress(OSError):
-                link.send(session.service.codec.encode(message, *companion.identity()), route)
+                link.send(session.service.hearing.codec.encode(message, *companion.identity()), route)
     return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_LOST,))}
 
 

@@ -1,4 +1,8 @@
-"""A recording through the same pipeline: what the service would have known, and how good it was."""
+"""A recording through the same pipeline: what the service would have known, and how good it was.
+
+A .tlog holds a link's bytes and is heard as one; a DataFlash log or a ULog holds readings and skips that storey. From
+the reading on everything is the path that flies.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,45 @@ import numpy as np
 
 from magmav.appraisal import CompassLog, describe
 from magmav.core.types import AttitudeReading, FieldModel, Reading, Record
-from magmav.link import Link
+from magmav.hearing import LinkRecording
+from magmav.link.tlog import TlogLink
+from magmav.logs import LogError, Progress, Recording
 from magmav.pipeline import Pipeline
 from magmav.reference import Reference
-from magmav.service import Service, Watcher
+from magmav.service import Watcher, all_counts, hand_on
 from magmav.settings import Settings
 from magmav.vehicle import Boot, Vehicle
 
 Result = dict[str, Any]
+
+
+def open_recording(path: str | Path, progress: Progress | None = None) -> Recording:
+    """A .tlog, .bin, .log or .ulg, told apart by what is in it, not by its name.
+
+    LinkError or LogError naming the file, what is wrong with it, and what to do.
+    """
+    path = Path(path)
+    front = _front(path)
+    if front.startswith(b"ULog"):
+        from magmav.logs.ulog import UlogRecording
+
+        return UlogRecording(path, progress)
+    if front.startswith((b"\xa3\x95", b"FMT,")):
+        from magmav.logs.dataflash_readings import DataflashRecording
+
+        return DataflashRecording(path, progress)
+    return LinkRecording(TlogLink(path, progress))
+
+
+def _front(path: Path) -> bytes:
+    """The file's first bytes, or none where TlogLink will say better what is wrong."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as file:
+            return file.read(4)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 class NothingToLearnFrom(Exception):
@@ -98,11 +133,11 @@ class Keeper:
 
 
 def replay(
-    link: Link,
+    recording: Recording,
     settings: Settings,
     model: FieldModel,
     *,
-    source: str,
+    source: str | None = None,
     learn_for_s: float | None = None,
     reference_csv: Path | None = None,
     watchers: Sequence[Watcher] = (),
@@ -115,16 +150,17 @@ def replay(
     Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
     """
     truth = None if reference_csv is None else Reference.from_csv(reference_csv)
-    pipeline = Pipeline(settings, model, link.unix_offset_ns)
+    source = recording.name if source is None else source
+    pipeline = Pipeline(settings, model, recording.unix_offset_ns)
     keeper = Keeper(pipeline, learn_for_s)
-    service = Service(link, pipeline, watchers=(keeper, *watchers))
-    service.run(stop)
+    play(recording, pipeline, (keeper, *watchers), stop)
     earlier = keeper.bring_back()
     if not keeper.compasses:
-        found = ", ".join(f"{n} {k}" for k, n in service.heard.most_common(6)) or "no message at all"
+        found = ", ".join(f"{n} {k}" for k, n in recording.heard.most_common(6)) or "no message at all"
         raise NothingToLearnFrom(
             f"{source}: no magnetometer data with a known tilt in it (found {found}); "
-            "record RAW_IMU or SCALED_IMU together with ATTITUDE"
+            "record RAW_IMU or SCALED_IMU together with ATTITUDE (.tlog), MAG with ATT and IMU (.bin), "
+            "or sensor_mag with vehicle_attitude (.ulg)"
         )
     vehicles = []
     for system in sorted({s for s, _ in keeper.compasses}):
@@ -139,5 +175,21 @@ def replay(
             if s == system
         ]
         facts = {"system": system, "autopilot": vehicle.autopilot, "reboots": vehicle.assembler.reboots}
-        vehicles.append(facts | {"compasses": compasses})
-    return {"source": source, "learn_for_s": learn_for_s, "vehicles": vehicles, "counts": service.counts()}
+        flights = [flight.as_seconds() for flight in boot.phase.flights]
+        vehicles.append(facts | {"flights": flights, "compasses": compasses})
+    counts = all_counts(_storeys(recording), pipeline)
+    return {"source": source, "learn_for_s": learn_for_s, "vehicles": vehicles, "counts": counts}
+
+
+def play(
+    recording: Recording, pipeline: Pipeline, watchers: Sequence[Watcher], stop: Callable[[], bool] = lambda: False
+) -> None:
+    """Every reading through the pipeline, until the end or until ``stop`` says so."""
+    for t_ns, reading in recording.readings():
+        hand_on(reading, t_ns, pipeline, watchers)
+        if stop():
+            return
+
+
+def _storeys(recording: Recording) -> dict[str, dict[str, int]]:
+    return recording.by_storey() if isinstance(recording, LinkRecording) else {"log": dict(recording.counts)}

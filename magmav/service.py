@@ -5,14 +5,13 @@ Live, replayed and simulated data run this same loop; a recorded link simply has
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from magmav.core.types import Reading, Record
+from magmav.hearing import Hearing
 from magmav.link import Link, Packet
-from magmav.mavlink.codec import Codec, Message, Outgoing
-from magmav.mavlink.decode import Decoder
+from magmav.mavlink.codec import Message, Outgoing
 from magmav.pipeline import Pipeline
 
 Watcher = Callable[[Reading, Record | None], None]
@@ -56,12 +55,10 @@ class Service:
         self.link = link
         self.pipeline = pipeline
         self.companion = companion
-        self.decoder = Decoder()
-        self.codec = Codec(self.decoder.wanted if companion is None else None)
-        self.heard: Counter[str] = Counter()
+        self.hearing = Hearing(everything=companion is not None)
+        self.heard = self.hearing.heard
         self.watchers = tuple(watchers)
         self.now_ns = 0
-        self._route = ""
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Until the link ends or ``stop`` says so. What was borrowed from the vehicle is given back."""
@@ -78,22 +75,16 @@ class Service:
         """One packet, or one quiet tick."""
         self.now_ns = packet.t_ns
         if packet.data:
-            if not self.link.datagrams and packet.route != self._route:
-                self.codec.forget(self._route)  # the stream was reopened: half a frame of its former life is lost
-                self._route = packet.route
-            for message in self.codec.decode(packet.data, packet.route, whole=self.link.datagrams):
+            for message in self.hearing.messages(packet, self.link.datagrams):
                 self._message(message, packet)
         if self.companion is not None:
             self._send(self.companion.poll(packet.t_ns))
 
     def _message(self, message: Message, packet: Packet) -> None:
-        self.heard[message.get_type()] += 1
-        for reading in self.decoder.readings(message):
-            record = self.pipeline.step(reading, packet.t_ns)
+        for reading in self.hearing.readings(message):
+            record = hand_on(reading, packet.t_ns, self.pipeline, self.watchers)
             if record is not None and self.companion is not None:
                 self.companion.on_record(record, packet.t_ns)
-            for watch in self.watchers:
-                watch(reading, record)
         if self.companion is not None:
             self._send(self.companion.on_message(message, packet.route, packet.t_ns))
 
@@ -102,15 +93,24 @@ class Service:
             return
         system, component = self.companion.identity()
         for message, route in outgoing:
-            self.link.send(self.codec.encode(message, system, component), route)
+            self.link.send(self.hearing.codec.encode(message, system, component), route)
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Everything that was counted on the way, by storey."""
-        out = {
-            "link": dict(self.link.counts),
-            "codec": dict(self.codec.counts),
-            "decode": dict(self.decoder.counts),
-        }
-        for system, vehicle in self.pipeline.vehicles.items():
-            out[f"vehicle {system}"] = dict(vehicle.assembler.counts + vehicle.counts)
-        return {storey: {k: v for k, v in numbers.items() if v} for storey, numbers in out.items()}
+        return all_counts({"link": dict(self.link.counts), **self.hearing.counts()}, self.pipeline)
+
+
+def hand_on(reading: Reading, t_ns: int, pipeline: Pipeline, watchers: Sequence[Watcher]) -> Record | None:
+    """One reading through the pipeline, shown to everybody who watches."""
+    record = pipeline.step(reading, t_ns)
+    for watch in watchers:
+        watch(reading, record)
+    return record
+
+
+def all_counts(source: Mapping[str, Mapping[str, int]], pipeline: Pipeline) -> dict[str, dict[str, int]]:
+    """What was counted at the source and for each vehicle, without the zeros."""
+    out = dict(source)
+    for system, vehicle in pipeline.vehicles.items():
+        out[f"vehicle {system}"] = vehicle.assembler.counts + vehicle.counts
+    return {storey: {k: v for k, v in numbers.items() if v} for storey, numbers in out.items()}

@@ -15,8 +15,7 @@ import pytest
 from magmav.cli import main
 from magmav.commands import finite
 from magmav.geomag import world_magnetic_model
-from magmav.link.tlog import TlogLink
-from magmav.recording import replay
+from magmav.recording import open_recording, replay
 from magmav.settings import Settings
 
 _DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -28,7 +27,7 @@ _SECONDS = 120.0
 
 
 def in_process(name, **options):
-    link = TlogLink(_DATA / name)
+    link = open_recording(_DATA / name)
     try:
         return replay(link, Settings(), world_magnetic_model, source=str(_DATA / name), **options)
     finally:

@@ -159,3 +159,85 @@ def test_disarmed_on_its_back_is_carrying():
     beat(phase, armed=False)
     over(phase, 5.0)
     assert phase.crash_ns is None
+
+
+# ---------------------------------------------------------------- the story of a flight
+
+
+def told(phase, until_s, height, landed=None, from_s=0.0):
+    """Ten times a second: heights over time, and what the autopilot says of landing, if it says anything."""
+    for tenth in range(round(from_s * 10), round(until_s * 10)):
+        now = tenth / 10
+        metres = height(now)
+        at_height(phase, metres, now, speed=0.0 if metres < 1.0 else 3.0)
+        if landed is not None:
+            phase.landed(LandedReading(1, landed(now)))
+        phase.learnable(round(now * S), False)
+
+
+def hop(now):
+    """Up at 5 s, at 10 m from 7 s to 20 s, down at 22 s."""
+    return max(0.0, min(10.0, (now - 5.0) * 5.0, (22.0 - now) * 5.0))
+
+
+def test_a_flight_is_told_from_arming_to_disarming():
+    phase = Phase()
+    beat(phase, armed=False)
+    told(phase, 2.0, hop)
+    beat(phase, at_s=2.0)
+    told(phase, 40.0, hop, from_s=2.0)
+    beat(phase, armed=False, at_s=40.0)
+    (flight,) = phase.flights
+    assert flight.as_seconds() == {
+        "armed_s": 2.0,
+        "takeoff_s": pytest.approx(6.0, abs=0.11),  # 5 m up
+        "landed_s": pytest.approx(21.6 + 3.0, abs=0.41),  # low and slow for three seconds
+        "disarmed_s": 40.0,
+        "crash_s": None,
+    }
+
+
+def test_the_autopilots_word_on_landing_counts_before_height():
+    phase = Phase()
+    beat(phase)
+    told(phase, 40.0, lambda now: 30.0, lambda now: Landed.IN_AIR if 5.0 < now < 25.0 else Landed.ON_GROUND)
+    assert phase.flights[0].as_seconds()["takeoff_s"] == pytest.approx(5.1)
+    assert phase.flights[0].as_seconds()["landed_s"] == pytest.approx(25.0)
+
+
+def test_two_hops_without_disarming_are_two_flights_of_one_arming():
+    phase = Phase()
+    beat(phase, at_s=1.0)
+    told(phase, 30.0, hop, from_s=1.0)
+    told(phase, 60.0, lambda now: hop(now - 30.0), from_s=30.0)
+    first, second = phase.flights
+    assert first.armed_ns == second.armed_ns == S
+    assert first.landed_ns < second.takeoff_ns < second.landed_ns
+    assert phase.takeoff_ns == first.takeoff_ns
+
+
+def test_disarming_in_the_air_ends_the_flight():
+    phase = Phase()
+    beat(phase)
+    told(phase, 10.0, lambda now: 50.0)
+    beat(phase, armed=False, at_s=10.0)
+    assert phase.flights[0].landed_ns == phase.flights[0].disarmed_ns == 10 * S
+
+
+def test_arming_without_flying_has_no_take_off():
+    phase = Phase()
+    beat(phase)
+    told(phase, 20.0, lambda now: 0.0)
+    beat(phase, armed=False, at_s=20.0)
+    beat(phase, at_s=30.0)
+    assert [(f.takeoff_ns, f.landed_ns) for f in phase.flights] == [(None, None), (None, None)]
+    assert [f.disarmed_ns for f in phase.flights] == [20 * S, None]
+
+
+def test_a_crash_stands_in_its_flight():
+    phase = Phase()
+    beat(phase)
+    told(phase, 5.0, lambda now: 20.0)
+    for tenth in range(50, 80):
+        phase.tilt(math.pi, 0.0, tenth * S // 10)
+    assert phase.flights[0].as_seconds()["crash_s"] == phase.crash_ns / S == 5.0

@@ -9,8 +9,7 @@ from flight_rig import IRON_MG, Flight, staying
 from magmav.core.types import Record
 from magmav.geomag import world_magnetic_model
 from magmav.link.recorder import TlogRecorder
-from magmav.link.tlog import TlogLink
-from magmav.recording import NothingToLearnFrom, replay
+from magmav.recording import NothingToLearnFrom, open_recording, replay
 from magmav.settings import Settings
 
 # The contract of DESIGN.md: these keys stay.
@@ -49,7 +48,7 @@ def again(recorded, data=None, **options):
         path.write_bytes(data)
     records: list[Record] = []
     options.setdefault("watchers", [lambda reading, record: None if record is None else records.append(record)])
-    link = TlogLink(path)
+    link = open_recording(path)
     try:
         return replay(link, Settings(), world_magnetic_model, source="x", **options), records
     finally:

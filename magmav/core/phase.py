@@ -1,4 +1,4 @@
-"""Is the vehicle flying, and since when? What stands on steel and concrete teaches nothing about a compass.
+"""Is the vehicle flying, since when and until when? What stands on steel and concrete teaches nothing about a compass.
 
 The altitude rule is for vehicles that fly. Rovers, boats, and anything that never says what it is, learn wherever
 they are (users.md N1, N11).
@@ -7,6 +7,7 @@ they are (users.md N1, N11).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from magmav.core.rotation import tilt_angle
 from magmav.core.types import Landed, LandedReading, MotionReading, PositionReading, VehicleReading
@@ -20,6 +21,27 @@ _BLIND_S = 10.0  # armed this long with neither height nor landed state known co
 _WHO_S = 3.0  # heartbeats come once a second: after this long without one nobody will say what it is
 _CRASH_TILT_RAD = math.radians(100.0)
 _CRASH_S = 1.0
+_DOWN_M, _DOWN_MPS, _DOWN_S = 2.0, 1.5, 3.0  # low and slow this long is a landing, where nobody says so
+
+
+@dataclass(slots=True)
+class Flight:
+    """One flight from arming to disarming, boot times; None where it did not happen or was not seen.
+
+    The first arming of a recording that begins armed is its first heartbeat. A second take-off without disarming in
+    between is a flight of its own with the same arming.
+    """
+
+    armed_ns: int
+    takeoff_ns: int | None = None
+    landed_ns: int | None = None
+    disarmed_ns: int | None = None
+    crash_ns: int | None = None
+
+    def as_seconds(self) -> dict[str, float | None]:
+        """For a result: armed_s, takeoff_s, landed_s, disarmed_s, crash_s."""
+        times = {name: getattr(self, f"{name}_ns") for name in ("armed", "takeoff", "landed", "disarmed", "crash")}
+        return {f"{name}_s": None if ns is None else round(ns / 1e9, 3) for name, ns in times.items()}
 
 
 class Phase:
@@ -31,6 +53,8 @@ class Phase:
         self.takeoff_ns: int | None = None
         self._first_ns: int | None = None
         self.crash_ns: int | None = None
+        self.flights: list[Flight] = []
+        self._low_since_ns: int | None = None
         self._landed: Landed | None = None
         self._armed_ns: int | None = None
         self._alt_m: float | None = None
@@ -49,6 +73,10 @@ class Phase:
         self.kind = r.kind
         if r.armed and not self.armed:
             self._armed_ns, self._alt_armed_m = boot_ns, self._alt_m
+            self.flights.append(Flight(boot_ns))
+        elif self.armed and not r.armed:
+            self._down(boot_ns)
+            self.flights[-1].disarmed_ns = boot_ns
         self.armed = r.armed
 
     def landed(self, r: LandedReading) -> None:
@@ -73,7 +101,37 @@ class Phase:
         up = self.armed and self._landed is not Landed.ON_GROUND and self._high(boot_ns)
         if up and self.takeoff_ns is None:
             self.takeoff_ns = boot_ns
+        if up:
+            self._up(boot_ns)
+        elif self.armed and self._stands(boot_ns):
+            self._down(boot_ns)
         return up
+
+    def _up(self, boot_ns: int) -> None:
+        """In the air: a take-off, unless this flight has had its own."""
+        now, self._low_since_ns = self.flights[-1], None
+        if now.landed_ns is not None:
+            now = Flight(now.armed_ns)
+            self.flights.append(now)
+        if now.takeoff_ns is None:
+            now.takeoff_ns = boot_ns
+
+    def _down(self, boot_ns: int) -> None:
+        """On the ground: a landing, if there was a take-off."""
+        now = self.flights[-1]
+        if now.takeoff_ns is not None and now.landed_ns is None:
+            now.landed_ns = boot_ns
+
+    def _stands(self, boot_ns: int) -> bool:
+        """On the ground as the autopilot says; where it does not say, low and slow for some seconds."""
+        if self._landed is not None:
+            return self._landed is Landed.ON_GROUND
+        low = self._height_m is not None and self._height_m < _DOWN_M and self._speed_mps < _DOWN_MPS
+        if not low:
+            self._low_since_ns = None
+        elif self._low_since_ns is None:
+            self._low_since_ns = boot_ns
+        return self._low_since_ns is not None and boot_ns - self._low_since_ns >= _DOWN_S * 1e9
 
     def _high(self, boot_ns: int) -> bool:
         heights = [] if self._height_m is None else [self._height_m]
@@ -93,7 +151,7 @@ class Phase:
         elif self._over_since_ns is None:
             self._over_since_ns = boot_ns
         elif self.crash_ns is None and boot_ns - self._over_since_ns > _CRASH_S * 1e9:
-            self.crash_ns = self._over_since_ns
+            self.crash_ns = self.flights[-1].crash_ns = self._over_since_ns
 
     def learnable(self, boot_ns: int, on_ground: bool) -> bool:
         """Does time at this boot time teach? ``on_ground`` is the operator saying that it always does."""

@@ -23,14 +23,18 @@ class LogError(Exception):
 class Recording(Protocol):
     """One recorded file.
 
-    counts : what was left out and why.  heard : how many messages of each kind the file holds.
+    heard : how many messages of each kind the file holds.
     unix_offset_ns : takes the times of ``readings`` to UNIX time where the file says so, else 0.
     """
 
     name: str
-    counts: Counter[str]
     heard: Counter[str]
     unix_offset_ns: int
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was left out and why."""
+        ...
 
     def readings(self) -> Iterator[tuple[int, Reading]]:
         """(t_ns, reading) in the order of time; t_ns is the vehicle's boot clock. Once through."""
