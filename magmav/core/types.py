@@ -244,6 +244,7 @@ class Sample:
     gap: bool
     tilt_from: str  # "ATTITUDE" or "OWN"
     learn: bool  # False on time that teaches nothing: on the ground, settling after a parameter change
+    axes: int = 3  # 2: a two-axis compass; the z of mag_b_mg means nothing, and the matrix does not mix it in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -328,6 +329,7 @@ class Record:
     verdict: Verdict
     learnt: bool  # this sample moved the estimate
     relative: bool = False  # stored offsets or device id unknown: offsets_mg is a change of whatever is stored
+    axes: int = 3  # 2: a two-axis compass; the z of mag_b_mg means nothing, that of corrected_b_mg comes from the dip
 
 
 # ---------------------------------------------------------------- writing to a vehicle

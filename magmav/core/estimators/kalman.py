@@ -1,11 +1,12 @@
 """A linear Kalman filter that uses attitude: the levelled field turns with the vehicle and is otherwise constant.
 
-State (9,), mG: b hard iron in the sensor's axes; h the Earth's field in levelled axes, (H cos psi, -H sin psi, V);
+State (10,), mG: b hard iron in the sensor's axes; h the Earth's field in levelled axes, (H cos psi, -H sin psi, V);
 d a short-lived disturbance in levelled axes (tilt error, motors), first-order Gauss-Markov.
 
 Process: when the gyro says the heading grew by a, h <- Rz(a) h; the gyro's own error is noise along the horizontal
 circle. b walks slowly. Measurement, with A and e the autopilot's own matrix and motor term:
     A m + e = A b + Rot(w t) R_bl (h + d) + n            Rot(w t) f: the field f as it was t earlier, at body rate w
+A two-axis compass gives the first two rows of it; b's third entry then stays unknown and harms nothing.
 Linear in all but t, and t is small, so no start value is needed and none can be wrong.
 The autopilot's yaw is never a measurement: it follows the compass being judged (estimation.md section 7.1).
 
@@ -185,24 +186,26 @@ class KalmanEstimator:
         roll, pitch, removed = self._tilt.calmed(s, n)
         body_from_level = level_from_body(roll, pitch).T
         level_field = self._x[_H] + self._x[_D]
+        k = s.axes
         predicted, H = measurement(s, body_from_level, self._x[_B], level_field, float(self._x[_T]))
-        z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        predicted, H = predicted[:k], H[:k]
+        z = (s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg)[:k]
         total = min(max(math.hypot(*self._x[_H]), 200.0), 700.0)
         smear = n.sync_s * math.hypot(*s.rate_b_rads) * total
-        R = _EYE3 * (n.reading_mg**2 + smear * smear + (removed * total) ** 2)
+        R = _EYE3[:k, :k] * (n.reading_mg**2 + smear * smear + (removed * total) ** 2)
         innovation = z - predicted
         S = H @ self._P @ H.T + R
         nis = float(innovation @ np.linalg.solve(S, innovation))
-        self._judge(nis / 3.0, innovation, s.dt_s)
-        limit = n.doubt_nis * self._factor()
+        self._judge(nis / k, innovation, s.dt_s)
+        limit = n.doubt_nis * (k / 3.0) * self._factor()
         if nis > limit:
             R = R + S * (nis / limit - 1.0)
         linear = innovation + H @ self._x  # filterpy subtracts H x again
         self._x, self._P = update(self._x, self._P, linear, R, H)
         self._samples += 1
-        left = linear - H @ self._x + body_from_level @ self._x[_D]
+        left = linear - H @ self._x + (body_from_level @ self._x[_D])[:k]
         self._residual_n += 1
-        self._residual_mg2 += (float(left @ left) / 3.0 - self._residual_mg2) / min(self._residual_n, 500)
+        self._residual_mg2 += (float(left @ left) / k - self._residual_mg2) / min(self._residual_n, 500)
 
     def _judge(self, nis: float, innovation: Array, dt_s: float) -> None:
         """Keep the innovation statistics; accept that the iron has changed when they stay bad."""
@@ -212,7 +215,8 @@ class KalmanEstimator:
             self._nis_sum += clipped
         weight = min(dt_s / 2.0, 0.2)
         self._recent_nis += weight * (clipped - self._recent_nis)
-        self._innovation_mg += weight * (innovation - self._innovation_mg)
+        whole = np.append(innovation, 0.0) if len(innovation) == 2 else innovation
+        self._innovation_mg += weight * (whole - self._innovation_mg)
         bad = nis > n.change_nis * self._factor() and self._samples > 30
         self._bad_s = max(0.0, self._bad_s + (dt_s if bad else -dt_s))
         if self._bad_s >= n.change_s and self._since_change_s >= n.change_hold_s:
