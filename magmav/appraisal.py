@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.rotation import level_from_body
 from magmav.core.types import Heading, Record, Shaping, State
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
@@ -43,6 +44,7 @@ class CompassLog:
     stored_true_rad: array[float] = field(default_factory=_doubles)
     declination_rad: array[float] = field(default_factory=_doubles)
     sigma_rad: array[float] = field(default_factory=_doubles)
+    down_mg: float | None = None  # of a two-axis compass: the Earth's downward field that stood in for its third
 
     def __len__(self) -> int:
         return len(self.boot_s)
@@ -55,6 +57,9 @@ class CompassLog:
         magnetic, true = _angles(record.heading) if started else (math.nan, math.nan)
         stored_magnetic, stored_true = _angles(record.stored_heading)
         self.last = record
+        if record.axes == 2 and record.heading.valid:
+            down = level_from_body(record.roll_rad, record.pitch_rad)[2]
+            self.down_mg = float(down @ record.corrected_b_mg)
         self.learnt += record.learnt
         self.boot_s.append(record.boot_ns / 1e9)
         self.age_s.append(record.age_s)
@@ -133,14 +138,14 @@ def scores(
     else:
         left_out["no heading"] = ~np.isfinite(log.magnetic_rad if magnetic else log.true_rad)
     calibrations = {
-        "full": Calibration(log.last.estimate.hard_iron_b_mg, matrix),
+        "full": Calibration(log.last.estimate.hard_iron_b_mg, log.last.estimate.soft_iron_b @ matrix),
         "offsets": Calibration(-offsets, matrix),
     }
     stored = vehicle.calibrations.offsets(log.last.compass)
     if stored is not None:
         calibrations["stored"] = Calibration(-stored, matrix)
     got = score_freeze(
-        measured_s, sensor, calibrations, np.where(unknown, 0.0, declination), reference, window, left_out
+        measured_s, sensor, calibrations, np.where(unknown, 0.0, declination), reference, window, left_out, log.down_mg
     )
     if learn_for_s is None:
         live = log.magnetic_rad if magnetic else log.true_rad

@@ -11,14 +11,18 @@ from __future__ import annotations
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.types import FieldModel, Reading, Record
 from magmav.settings import Settings
-from magmav.vehicle import Vehicle
+from magmav.vehicle import Tap, Vehicle
 
 
 class Pipeline:
-    """Every vehicle on a link. ``unix_offset_ns`` takes arrival time to UNIX time, for the field model's date."""
+    """Every vehicle on a link. ``unix_offset_ns`` takes arrival time to UNIX time, for the field model's date.
 
-    def __init__(self, settings: Settings, model: FieldModel, unix_offset_ns: int = 0) -> None:
+    tap : sees every Sample before it is learnt from, see vehicle.Tap.
+    """
+
+    def __init__(self, settings: Settings, model: FieldModel, unix_offset_ns: int = 0, tap: Tap | None = None) -> None:
         self.settings = settings
+        self._tap = tap
         self._model = model
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
@@ -34,5 +38,5 @@ class Pipeline:
         """Take one reading that arrived at t_ns; a Record when it was a fresh magnetometer value."""
         vehicle = self.vehicles.get(reading.system)
         if vehicle is None:
-            vehicle = self.vehicles[reading.system] = Vehicle(reading.system, self.settings, self._model)
+            vehicle = self.vehicles[reading.system] = Vehicle(reading.system, self.settings, self._model, self._tap)
         return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)

@@ -86,6 +86,14 @@ def magnetic_heading_rad(field_b_mg: ArrayLike, roll_rad: ArrayLike, pitch_rad: 
     return np.asarray(np.arctan2(-right, ahead), dtype=np.float64)
 
 
+def with_third_axis(field_b_mg: Floats, roll_rad: Floats, pitch_rad: Floats, down_mg: float) -> Floats:
+    """Body fields (N, 3) with z as the dip demands it at (N,) tilts (Sytnyk et al. 2014, Z_ES)."""
+    x, y, _ = field_b_mg.T
+    level = np.cos(pitch_rad) * np.cos(roll_rad)
+    z = (down_mg + x * np.sin(pitch_rad) - y * np.cos(pitch_rad) * np.sin(roll_rad)) / level
+    return np.column_stack([x, y, z])
+
+
 def heading_error_rad(boot_s: ArrayLike, heading_true_rad: ArrayLike, reference: Reference) -> Floats:
     """Heading minus reference, (N,) rad in [-pi, pi); NaN where either is not known."""
     return shortest_rad(np.asarray(heading_true_rad) - reference.interpolate(boot_s).yaw_true_rad)
@@ -171,10 +179,12 @@ def score_freeze(
     reference: Reference,
     window: Window = EVERYTHING,
     leave_out: Mapping[str, ArrayLike] | None = None,
+    down_mg: float | None = None,
 ) -> dict[str, HeadingScore]:
     """Scores of frozen calibrations, and "uncalibrated", applied to the sensor's own field (N, 3) mG.
 
     Declination is scalar or (N,), rad. All are scored on the same samples with the reference's tilt.
+    down_mg : for a two-axis compass, the Earth's downward field that stands in for the third axis.
     """
     raw, at = _vectors(mag_b_mg, "mag_b_mg"), reference.interpolate(boot_s)
     headings: dict[str, Floats] = {}
@@ -182,7 +192,10 @@ def score_freeze(
         offset, shape = np.asarray(hard_iron, dtype=np.float64), np.asarray(matrix, dtype=np.float64)
         if offset.shape not in ((3,), raw.shape) or shape.shape != (3, 3):
             raise ValueError(f"{name}: want hard iron (3,) or {raw.shape} and a (3, 3) matrix")
-        heading = magnetic_heading_rad((raw - offset) @ shape.T, at.roll_rad, at.pitch_rad)
+        field = (raw - offset) @ shape.T
+        if down_mg is not None:
+            field = with_third_axis(field, at.roll_rad, at.pitch_rad, down_mg)
+        heading = magnetic_heading_rad(field, at.roll_rad, at.pitch_rad)
         headings[name] = np.where(at.valid, heading + np.asarray(declination_rad), 0.0)
     return score_headings(boot_s, headings, reference, window, leave_out)
 

@@ -37,6 +37,14 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     alt_m: Annotated[float, _knob("altitude above mean sea level", "m", ge=-500.0, le=20000.0)] = 0.0
 
 
+class Compass(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What kind of sensor the compass is."""
+
+    axes: Annotated[
+        int, _knob("3, or 2: only x and y are used, the third comes from the dip of the place", ge=2, le=3)
+    ] = 3
+
+
 class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is learnt from, and how."""
 
@@ -92,6 +100,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     vehicle: Vehicle = field(default_factory=Vehicle)
     place: Place = field(default_factory=Place)
+    compass: Compass = field(default_factory=Compass)
     learn: Learn = field(default_factory=Learn)
     gate: Gate = field(default_factory=Gate)
     wire: Wire = field(default_factory=Wire)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -12,6 +13,7 @@ import numpy as np
 from magmav.core import gate
 from magmav.core.assemble import Assembler
 from magmav.core.channel import Channel, Circumstances, Finding
+from magmav.core.correction import without_third
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.heading import UNKNOWN
@@ -31,6 +33,7 @@ from magmav.core.types import (
     Reading,
     Reason,
     Record,
+    Sample,
     State,
     ThrottleReading,
     TimeReading,
@@ -40,17 +43,24 @@ from magmav.core.types import (
     vec3,
 )
 from magmav.mavlink.autopilot.ardupilot import Calibrations
+from magmav.mavlink.autopilot.px4 import Px4Calibrations
+from magmav.mavlink.autopilot.stored import StoredCalibrations
 from magmav.settings import Settings
 
 _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
 _SAY_FROZEN_NS = 1_000_000_000
+_ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
+
+
+Tap = Callable[[Sample, Circumstances, tuple[int, int]], None]
+"""Sees every Sample with its circumstances, and the number of boots and of foreign parameter changes before it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Boot:
     """What stays of the vehicle's time before a reboot: enough to judge what was learnt then."""
 
-    calibrations: Calibrations
+    calibrations: StoredCalibrations
     phase: Phase
     began_ns: int | None
 
@@ -62,15 +72,16 @@ class Boot:
 class Vehicle:
     """One vehicle: what it says of itself, and one channel per compass."""
 
-    def __init__(self, system: int, settings: Settings, model: FieldModel) -> None:
+    def __init__(self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None) -> None:
         self.system = system
+        self._tap = tap
         self.settings = settings
         self.autopilot = 0
         self.learning = settings.learn.on
         self.learn_for_s: float | None = None
         self.assembler = Assembler(system)
         self.phase = Phase()
-        self.calibrations = Calibrations()
+        self._books = _books()
         self.former: Boot | None = None
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[str] = Counter()
@@ -109,12 +120,15 @@ class Vehicle:
                 self.phase.moving(r)
             case VehicleReading():
                 self.autopilot = r.autopilot
+                self.calibrations.armed(r.armed)
                 self.phase.vehicle(r, self._now_ns())
             case LandedReading():
                 self.phase.landed(r)
             case ParamReading():
-                for compass in self.calibrations.param(r):
-                    self.settle(compass)
+                for book in self._books.values():
+                    changed = book.param(r)
+                    for compass in changed if book is self.calibrations else ():
+                        self.settle(compass)
             case ThrottleReading():
                 self.calibrations.throttle(r.share)
             case CurrentReading():
@@ -125,7 +139,10 @@ class Vehicle:
         return None
 
     def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
-        held, compass = self.calibrations, r.compass
+        held, compass, axes = self.calibrations, r.compass, self.settings.compass.axes
+        held.sensor(compass, r.device_id, r.source)
+        if axes == 2:
+            r = replace(r, field_b_mg=vec3((*r.field_b_mg[:2], 0.0), "field"))
         channel = self._channel(compass)
         channel.held = not self.learning or self._over(r.boot_ns)
         if held.epoch(compass) != self._epochs.get(compass) and not channel.keeps:
@@ -136,12 +153,19 @@ class Vehicle:
             self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
             return None
         learn = self._teaches(compass, r.boot_ns) and not channel.held
+        undo: Callable[[Vec3], Vec3] = partial(held.undo, compass, source=r.source)
         shaping = held.shaping(compass)
-        sample = self.assembler.mag(r, partial(held.undo, compass), shaping, learn)
+        if axes == 2:
+            undo, shaping = without_third(undo, shaping)
+        sample = self.assembler.mag(r, undo, shaping, learn, axes)
         self._after_reboot()
         if sample is None:
             return self._frozen(r, t_ns, channel)
-        finding = channel.step(sample, r.field_b_mg, self._circumstances(compass, unix_ns))
+        circumstances = self._circumstances(compass, unix_ns)
+        if self._tap is not None:
+            self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
+        used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
+        finding = channel.step(sample, used_b_mg, circumstances)
         record = self._latest[compass] = Record(
             t_ns=t_ns,
             system=self.system,
@@ -151,7 +175,7 @@ class Vehicle:
             age_s=sample.age_s,
             mag_b_mg=sample.mag_b_mg,
             corrected_b_mg=finding.corrected_b_mg,
-            stored_b_mg=r.field_b_mg,
+            stored_b_mg=used_b_mg,
             roll_rad=sample.roll_rad,
             pitch_rad=sample.pitch_rad,
             estimate=finding.estimate,
@@ -162,6 +186,7 @@ class Vehicle:
             verdict=finding.verdict,
             learnt=sample.learn,
             relative=not held.known(compass),
+            axes=axes,
         )
         return record
 
@@ -187,6 +212,11 @@ class Vehicle:
         return said
 
     # ------------------------------------------------------------ the questions asked on the way
+
+    @property
+    def calibrations(self) -> StoredCalibrations:
+        """What this vehicle stores for its compasses, by the rules of its autopilot (ArduPilot's until it says)."""
+        return self._books.get(self.autopilot, self._books[_ARDUPILOT])
 
     def _now_ns(self) -> int:
         return self.assembler.clock.latest_ns or 0
@@ -245,7 +275,7 @@ class Vehicle:
         kind = self.phase.kind
         self.phase = Phase()
         self.phase.kind = kind
-        self.calibrations = Calibrations()
+        self._books = _books()
         self._epochs.clear()
         self._settle_until_ns.clear()
         self._latest.clear()
@@ -253,6 +283,11 @@ class Vehicle:
         for channel in self.channels.values():
             if not channel.keeps:
                 channel.restart()
+
+
+def _books() -> dict[int, StoredCalibrations]:
+    """One of each kind: parameters may be heard before the heartbeat that says whose they are."""
+    return {_ARDUPILOT: Calibrations(), _PX4: Px4Calibrations()}
 
 
 def limits(settings: Settings) -> gate.Limits:

@@ -24,6 +24,8 @@ _GAP_S = 0.5
 _SOURCE_SILENT_NS = 2_000_000_000
 _REFRESH_S = 0.1  # ArduPilot's refresh; a slower stream only shows it more rarely
 _AVERAGED_S = 0.07
+# PX4's logs stamp a value with the time it was measured, so it has no age.
+_STAMPED = frozenset({"sensor_mag", "vehicle_magnetometer", "sensor_combined"})
 _PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")
 
 
@@ -89,7 +91,7 @@ class _Compass:
         ArduPilot sends the mean of the last 100 ms (autopilots.md 1.1), then the value waits for the next message.
         A compass that brings news faster than that is not averaged so, and nothing is known of its delay.
         """
-        if self.refresh_s < _AVERAGED_S:
+        if self.refresh_s < _AVERAGED_S or self.source in _STAMPED:
             return 0.0
         return 0.5 * (_REFRESH_S + min(self.period_s, _REFRESH_S))
 
@@ -134,7 +136,9 @@ class Assembler:
         if compass in self._compasses:
             self._compasses[compass].restart = True
 
-    def mag(self, reading: MagReading, undo: Callable[[Vec3], Vec3], shaping: Shaping, learn: bool) -> Sample | None:
+    def mag(
+        self, reading: MagReading, undo: Callable[[Vec3], Vec3], shaping: Shaping, learn: bool, axes: int = 3
+    ) -> Sample | None:
         """A Sample when this is a fresh value whose tilt is known.
 
         ``undo`` takes the value as sent back to the sensor's own field; it is called only for fresh values.
@@ -179,6 +183,7 @@ class Assembler:
             gap=gap,
             tilt_from=state.source,
             learn=learn,
+            axes=axes,
         )
         known.sent_b_mg, known.fresh_ns, known.turned_rad = reading.field_b_mg, reading.boot_ns, 0.0
         known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False

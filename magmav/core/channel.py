@@ -10,12 +10,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magmav.core import gate
+from magmav.core.correction import (
+    corrected_field,
+    covariance_of_field,
+    field_of,
+    published,
+    stored_heading,
+    turned_on,
+)
 from magmav.core.estimators import Estimator
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
-from magmav.core.heading import UNKNOWN, heading, heading_sigma, magnetic_heading
-from magmav.core.rotation import euler_rates, wrap_tau
-from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Sample, State, Vec3, Verdict, vec3
+from magmav.core.heading import UNKNOWN, heading_sigma, magnetic_heading
+from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
 _SIGMA_FLOOR_MG = (1.5, 1.5, 5.5)  # a real flight (thor75) missed its batch fit by 12 to 19 mG in z
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
@@ -60,6 +67,8 @@ class _Belief:
     offsets_mg: Vec3
     sigma_mg: Vec3
     heading_sigma_rad: float
+    covariance_b_mg2: Mat3  # of the corrected field
+    tilt_sigma_rad: float
 
 
 _NO_ESTIMATE = Estimate(ZERO3, np.diag([1e6] * 3), vec3([1e3] * 3, "sigma"), 0.0, 0.0, 0.0, 1.0, 0, 1e9)
@@ -93,6 +102,34 @@ class Channel:
 
     def step(self, s: Sample, sent_b_mg: Vec3, c: Circumstances) -> Finding:
         """Take one sample, and the same value as the autopilot sent it."""
+        belief = self.learn(s, c)
+        e = belief.estimate
+        corrected = corrected_field(s, e, c.expected)
+        now = UNKNOWN
+        if self._estimate is not None and belief.heading_sigma_rad < _GUESS_RAD:
+            then = published(
+                s,
+                corrected,
+                e.horizontal_mg,
+                belief.covariance_b_mg2,
+                belief.heading_sigma_rad,
+                belief.tilt_sigma_rad,
+                c.expected,
+            )
+            now = turned_on(s, e.delay_s, then)
+        return Finding(
+            estimate=e,
+            offsets_mg=belief.offsets_mg,
+            sigma_mg=belief.sigma_mg,
+            corrected_b_mg=corrected,
+            heading=now,
+            stored_heading=stored_heading(s, sent_b_mg, c.expected),
+            verdict=self.verdict,
+            coverage=self._excitation.coverage,
+        )
+
+    def learn(self, s: Sample, c: Circumstances) -> _Belief:
+        """Take one sample without making a heading of it; what is believed after it."""
         if self.held:
             self._resume = True
         else:
@@ -100,32 +137,7 @@ class Channel:
         belief = self._belief
         if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
             belief = self._believe(s, c)
-        corrected = s.shaping.matrix @ (s.mag_b_mg - belief.estimate.hard_iron_b_mg) + s.shaping.motor_b_mg
-        declination = None if c.expected is None else c.expected.declination_rad
-        known = self._estimate is not None and belief.heading_sigma_rad < _GUESS_RAD
-        return Finding(
-            estimate=belief.estimate,
-            offsets_mg=belief.offsets_mg,
-            sigma_mg=belief.sigma_mg,
-            corrected_b_mg=corrected,
-            heading=self._now(
-                s,
-                belief.estimate.delay_s,
-                heading(corrected, s.roll_rad, s.pitch_rad, belief.heading_sigma_rad, declination),
-            )
-            if known
-            else UNKNOWN,
-            stored_heading=heading(sent_b_mg, s.roll_rad, s.pitch_rad, math.pi, declination),
-            verdict=self.verdict,
-            coverage=self._excitation.coverage,
-        )
-
-    @staticmethod
-    def _now(s: Sample, delay_s: float, h: Heading) -> Heading:
-        """The heading of the measurement, turned on to the time of the message by the gyro."""
-        lead = s.lead_rad + delay_s * euler_rates(s.roll_rad, s.pitch_rad, s.rate_b_rads)[2]
-        magnetic, true = wrap_tau(h.magnetic_rad + lead), wrap_tau(h.true_rad + lead)
-        return replace(h, magnetic_rad=magnetic, true_rad=true)
+        return belief
 
     def _believe(self, s: Sample, c: Circumstances) -> _Belief:
         """Ask the estimator and judge its answer; a few times a second is often enough."""
@@ -133,10 +145,10 @@ class Channel:
             self._estimate = self._estimator.estimate(c.expected)
         e = self._estimate or _NO_ESTIMATE
         if s.learn and self._estimate is not None:
-            self._follow(s, e)
+            self._follow(s, e, c.expected)
         sigma = gate.floored(e, _SIGMA_FLOOR_MG)
-        down, horizontal = self._field(e, c.expected)
-        covariance = s.shaping.matrix @ e.covariance_mg2 @ s.shaping.matrix.T
+        horizontal, down = field_of(e, c.expected)
+        covariance = covariance_of_field(s, e)
         tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
         self._belief = _Belief(
             s.boot_ns,
@@ -144,6 +156,8 @@ class Channel:
             vec3(-e.hard_iron_b_mg, "offsets"),
             sigma,
             heading_sigma(covariance, horizontal, down, s.roll_rad, s.pitch_rad, tilt_sigma),
+            covariance,
+            tilt_sigma,
         )
         self._judge(s, c, sigma, heading_sigma(covariance, horizontal, down, 0.0, 0.0, 0.0))
         return self._belief
@@ -154,15 +168,9 @@ class Channel:
         self._resume = False
         return replace(s, gap=True, yaw_step_rad=0.0)
 
-    @staticmethod
-    def _field(e: Estimate, expected: ExpectedField | None) -> tuple[float, float]:
-        if expected is not None:
-            return expected.down_mg, expected.horizontal_mg
-        return e.down_mg, e.horizontal_mg
-
-    def _follow(self, s: Sample, e: Estimate) -> None:
+    def _follow(self, s: Sample, e: Estimate, expected: ExpectedField | None) -> None:
         """Remember what has been seen, how strong the field is, and where the estimate was."""
-        corrected = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
+        corrected = corrected_field(s, e, expected)
         self._excitation.see(corrected, magnetic_heading(corrected, s.roll_rad, s.pitch_rad))
         field_mg = float(np.linalg.norm(corrected))
         weight = _FIELD_WEIGHT if self._field_mg else 1.0
@@ -197,5 +205,6 @@ class Channel:
             assumed=c.assumed,
             parameters_changed=c.parameters_changed,
             grounded=c.grounded,
+            axes=s.axes,
         )
         self.verdict = gate.judge(evidence, self.limits, self.verdict.state)

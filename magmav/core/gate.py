@@ -17,6 +17,7 @@ from magmav.core.types import AxisState, Estimate, Reason, State, Vec3, Verdict
 
 _WEAK_HORIZONTAL_MG = 100.0
 _EARTH_MG = (150.0, 950.0)
+_EARTH_LEVEL_MG = (_WEAK_HORIZONTAL_MG / 2.0, 450.0)  # horizontally, all that two axes show without a position
 _FROZEN_S = 3.0
 _SLACK = 1.25  # a verdict once reached is kept until a line is crossed by this much: no flicker
 _HEADING_SECTORS = 3
@@ -51,6 +52,7 @@ class Evidence:
     assumed: bool
     parameters_changed: bool
     grounded: bool  # a flying vehicle that has not flown yet
+    axes: int = 3  # 2: the third component of the field comes from the dip, or is missing without a position
 
 
 _Z_NOTE: dict[AxisState, tuple[Reason, ...]] = {
@@ -81,7 +83,7 @@ def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
         return Verdict(State.LEARNING, NOTHING.axes, (reason, *relative, *_notes(e)))
     slack = _SLACK if was is State.READY else 1.0
     axes = axis_states(e.estimate.own_sigma_mg, e.sigma_mg, limits.axis_sigma_mg)
-    notes = _Z_NOTE[axes[2]] + _notes(e)
+    notes = (_Z_NOTE[axes[2]] if e.axes == 3 else (Reason.TWO_AXES,)) + _notes(e)
     wrong = _wrong(e, e.estimate, limits, slack)
     missing = _missing(e, e.estimate, axes, limits, slack)
     if wrong:
@@ -97,7 +99,8 @@ def _wrong(e: Evidence, estimate: Estimate, limits: Limits, slack: float) -> tup
     if e.frozen_s > _FROZEN_S:
         out.append(Reason.FROZEN)
     if e.expected is None:
-        earthlike = _EARTH_MG[0] <= e.field_mg <= _EARTH_MG[1]
+        least, most = _EARTH_MG if e.axes == 3 else _EARTH_LEVEL_MG
+        earthlike = least <= e.field_mg <= most
     else:
         earthlike = abs(e.field_mg - e.expected.total_mg) <= limits.field_share * slack * e.expected.total_mg
     if not earthlike and estimate.samples >= limits.samples:

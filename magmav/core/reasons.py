@@ -31,6 +31,7 @@ class Reason(Enum):
     PARAMETERS_CHANGED = (18, "compass parameters changed: data before is not used")
     STALE = (19, "no fresh magnetometer data")
     FROZEN = (20, "magnetometer value never changes: sensor stuck")
+    TWO_AXES = (22, "two axes used: the third comes from the dip of the place; without a position no heading")
     NO_CALIBRATION = (21, "no calibration that is ready for this compass")
     ARMED = (30, "vehicle is armed")
     NOT_LANDED = (31, "vehicle is not known to be on the ground")

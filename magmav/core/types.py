@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
@@ -56,7 +56,8 @@ class MagReading:
     compass: int  # 1, 2 or 3
     source: str  # message name, so that one compass seen through two messages is not two compasses
     boot_ns: int
-    field_b_mg: Vec3
+    field_b_mg: Vec3  # PX4's logged sensor_mag alone is in the sensor's own axes, see mavlink/autopilot/px4
+    device_id: int = 0  # where the message says it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,6 +268,7 @@ class Estimate:
     samples: int
     changed_ago_s: float  # seconds since the last sudden change was accepted; large when never
     delay_s: float = 0.0  # of the compass, beyond Sample.age_s, as far as the method can tell
+    soft_iron_b: Mat3 = field(default_factory=lambda: IDENTITY3)  # truth is soft_iron_b @ (shaping.matrix @ (sensor - hard iron) + motor)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,338 @@
+"""Every estimator on one recording, side by side: fitted on the first half, scored on the second, and in-sample.
+
+The recording goes through the pipeline once; the Samples it leads to are kept and given to each method in turn, so all
+methods see the same values, the same tilt and the same moments that teach. Scores of one column are made on the
+same samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magmav.core.channel import Channel, Circumstances
+from magmav.core.estimators import ESTIMATORS, Estimator
+from magmav.core.field import ExpectedField
+from magmav.core.types import Estimate, FieldModel, Sample, Vec3
+from magmav.logs import Recording
+from magmav.pipeline import Pipeline
+from magmav.recording import Keeper, NothingToLearnFrom, play
+from magmav.reference import Reference
+from magmav.score import Calibration, HeadingScore, Window, score_freeze
+from magmav.settings import Settings
+from magmav.vehicle import Boot, Vehicle, limits
+
+Floats = NDArray[np.float64]
+Result = dict[str, Any]
+UNKNOWN_MG = 900.0
+"""A method that claims an axis no better than this says nothing about it."""
+
+
+class Heard(NamedTuple):
+    """One Sample and what the vehicle contributed to its verdict."""
+
+    sample: Sample
+    circumstances: Circumstances
+
+
+@dataclass(slots=True)
+class Tape:
+    """The Samples of one compass, of the last stretch corrected in one way that taught something."""
+
+    heard: list[Heard] = field(default_factory=list)
+    learnt: int = 0
+    _stretch: tuple[int, int] | None = None
+    _before: list[Heard] = field(default_factory=list)
+    _before_learnt: int = 0
+
+    def add(self, sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
+        """Take one; another stretch begins anew."""
+        if stretch != self._stretch:
+            if self.learnt:
+                self._before, self._before_learnt = self.heard, self.learnt
+            self.heard, self.learnt, self._stretch = [], 0, stretch
+        self.heard.append(Heard(sample, circumstances))
+        self.learnt += sample.learn
+
+    def close(self) -> None:
+        """At the end of the recording: where the last stretch taught nothing, the one before it counts."""
+        if not self.learnt and self._before_learnt:
+            self.heard, self.learnt = self._before, self._before_learnt
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """A tape as arrays, (N,) or (N, 3); sensor_b_mg has the motor term taken out."""
+
+    boot_s: Floats
+    sensor_b_mg: Floats
+    roll_rad: Floats
+    pitch_rad: Floats
+    learn: NDArray[np.bool_]
+    declination_rad: Floats  # NaN where no position was known
+
+    @classmethod
+    def of(cls, heard: Sequence[Heard]) -> Columns:
+        """The columns of a tape."""
+        samples = [h.sample for h in heard]
+        sensor = np.array([s.mag_b_mg for s in samples])
+        motor = np.array([s.shaping.motor_b_mg for s in samples])
+        if motor.any():
+            matrix = np.array([s.shaping.matrix for s in samples])
+            sensor = sensor + np.linalg.solve(matrix, motor[:, :, None])[:, :, 0]
+        expected = [h.circumstances.expected for h in heard]
+        return cls(
+            np.array([s.boot_ns / 1e9 - s.age_s for s in samples]),
+            sensor,
+            np.array([s.roll_rad for s in samples]),
+            np.array([s.pitch_rad for s in samples]),
+            np.array([s.learn for s in samples], dtype=bool),
+            np.array([math.nan if e is None else e.declination_rad for e in expected]),
+        )
+
+
+class _Timed:
+    """An estimator that keeps its own bill. Satisfies Estimator."""
+
+    def __init__(self, inner: Estimator, clock: Callable[[], float]) -> None:
+        self.inner = inner
+        self._clock = clock
+        self.spent_s = 0.0
+
+    def step(self, sample: Sample) -> None:
+        """Pass on, and note how long it took."""
+        begun = self._clock()
+        self.inner.step(sample)
+        self.spent_s += self._clock() - begun
+
+    def estimate(self, expected: ExpectedField | None) -> Estimate | None:
+        """Pass on."""
+        return self.inner.estimate(expected)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What one method made of a tape: after the first half, at the end, its cost, and the gate's word on it."""
+
+    name: str
+    half: Estimate | None
+    whole: Estimate | None
+    us_per_sample: float
+    state: str
+    reasons: tuple[str, ...]
+    refusal: str | None
+    has_sigma: bool
+
+
+def try_estimator(
+    name: str, heard: Sequence[Heard], half: int, settings: Settings, clock: Callable[[], float]
+) -> Outcome:
+    """One method over one tape. ``half``: index of the first sample that is not of the first half."""
+    made: list[_Timed] = []
+
+    def make() -> Estimator:
+        made.append(_Timed(ESTIMATORS[name](), clock))
+        return made[-1]
+
+    channel = Channel(make, limits(settings), settings.gate.steady_s)
+    first: Estimate | None = None
+    for index, (sample, circumstances) in enumerate(heard):
+        if index == half:
+            first = made[-1].estimate(circumstances.expected)
+        channel.learn(sample, circumstances)
+    timed = made[-1]
+    whole = timed.estimate(heard[-1].circumstances.expected)
+    why = getattr(timed.inner, "why_not", None)
+    return Outcome(
+        name=name,
+        half=first,
+        whole=whole,
+        us_per_sample=1e6 * timed.spent_s / len(heard),
+        state=channel.verdict.state.name,
+        reasons=tuple(r.name for r in channel.verdict.reasons),
+        refusal=None if whole is not None else (None if why is None else why()) or "too little data",
+        has_sigma=bool(getattr(timed.inner, "has_sigma", True)),
+    )
+
+
+def compare(
+    recording: Recording,
+    settings: Settings,
+    model: FieldModel,
+    *,
+    clock: Callable[[], float],
+    source: str | None = None,
+    reference_csv: Path | None = None,
+    only: Sequence[str] = (),
+    progress: Callable[[str], None] = lambda text: None,
+    tapes: dict[tuple[int, int], Columns] | None = None,
+) -> Result:
+    """The document that ``magmav compare --json`` prints.
+
+    clock : seconds, for the cost per sample.  only : names of ESTIMATORS; all when empty.
+    tapes : filled with the points each compass was fitted to, for pictures.
+    Raises ValueError for an unknown name, NothingToLearnFrom when no compass was heard, TruthError for a bad
+    reference file.
+    """
+    names = list(only) or list(ESTIMATORS)
+    unknown = [n for n in names if n not in ESTIMATORS]
+    if unknown:
+        raise ValueError(f"no estimator called {unknown[0]!r}; there are {', '.join(ESTIMATORS)}")
+    source = recording.name if source is None else source
+    truth = None if reference_csv is None else Reference.from_csv(reference_csv)
+    kept: dict[tuple[int, int], Tape] = {}
+
+    def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
+        kept.setdefault((sample.system, sample.compass), Tape()).add(sample, circumstances, stretch)
+
+    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap)
+    keeper = Keeper(pipeline, None)
+    progress(f"{source}: reading")
+    play(recording, pipeline, [keeper])
+    earlier = keeper.bring_back()
+    if not kept:
+        found = ", ".join(f"{n} {k}" for k, n in recording.heard.most_common(6)) or "no message at all"
+        raise NothingToLearnFrom(f"{source}: no magnetometer data with a known tilt in it (found {found})")
+    vehicles: dict[int, Result] = {}
+    for (system, compass), tape in sorted(kept.items()):
+        tape.close()
+        vehicle = pipeline.vehicles[system]
+        boot: Vehicle | Boot = earlier.get(system, vehicle)
+        entry = vehicles.setdefault(
+            system, {"system": system, "autopilot": vehicle.autopilot, "flights": [], "compasses": []}
+        )
+        entry["flights"] = [flight.as_seconds() for flight in boot.phase.flights]
+        columns = Columns.of(tape.heard)
+        if tapes is not None:
+            tapes[system, compass] = columns
+        reference = keeper.reference(system, truth)
+        settings_of = (settings, clock)
+        outcomes: list[Outcome] = []
+        half = first_half(columns)
+        for name in names:
+            progress(f"{source}: compass {compass}, {name}")
+            outcomes.append(try_estimator(name, tape.heard, half, *settings_of))
+        entry["compasses"].append(_compass(compass, tape, columns, half, outcomes, boot, reference))
+    return {"source": source, "reference_file": None if reference_csv is None else str(reference_csv),
+            "vehicles": list(vehicles.values())}  # fmt: skip
+
+
+def first_half(columns: Columns) -> int:
+    """Index of the first sample after half of the time that taught."""
+    taught = np.flatnonzero(columns.learn)
+    if len(taught) == 0:
+        return len(columns.learn) // 2
+    middle = 0.5 * (columns.boot_s[taught[0]] + columns.boot_s[taught[-1]])
+    return int(np.searchsorted(columns.boot_s, middle, side="right"))
+
+
+def _compass(
+    compass: int,
+    tape: Tape,
+    columns: Columns,
+    half: int,
+    outcomes: Sequence[Outcome],
+    boot: Vehicle | Boot,
+    reference: Reference | None,
+) -> Result:
+    matrix = tape.heard[-1].sample.shaping.matrix
+    stored = boot.calibrations.offsets(compass)
+    split_s = float(columns.boot_s[min(half, len(columns.boot_s) - 1)])
+    crash_ns = boot.phase.crash_ns
+    crash_s = math.inf if crash_ns is None else crash_ns / 1e9
+    second, name = _score(
+        columns, _calibrations(outcomes, "half", matrix, stored), reference, Window(split_s, crash_s=crash_s)
+    )
+    whole, _ = _score(columns, _calibrations(outcomes, "whole", matrix, stored), reference, Window(crash_s=crash_s))
+    taught = columns.learn.nonzero()[0]
+    rows = [_row(o, columns, matrix, second.get(o.name), whole.get(o.name)) for o in outcomes]
+    return {
+        "compass": compass,
+        "device_id": boot.calibrations.device_id(compass) or None,
+        "samples": len(columns.boot_s),
+        "samples_learnt": tape.learnt,
+        "learnt_from_s": float(columns.boot_s[taught[0]]) if len(taught) else None,
+        "learnt_to_s": float(columns.boot_s[taught[-1]]) if len(taught) else None,
+        "split_s": split_s,
+        "reference": name,
+        "uncalibrated": {"second_half": _heading(second.get("uncalibrated")), "in_sample": _heading(whole.get("uncalibrated"))},
+        "stored": None
+        if stored is None
+        else {
+            "offsets_mg": [float(v) for v in stored],
+            "second_half": _heading(second.get("stored")),
+            "in_sample": _heading(whole.get("stored")),
+        },
+        "estimators": rows,
+    }  # fmt: skip
+
+
+def _calibrations(
+    outcomes: Iterable[Outcome], which: str, matrix: Floats, stored: Vec3 | None
+) -> dict[str, Calibration]:
+    out = {} if stored is None else {"stored": Calibration(-stored, matrix)}
+    for o in outcomes:
+        estimate: Estimate | None = getattr(o, which)
+        if estimate is not None:
+            out[o.name] = Calibration(estimate.hard_iron_b_mg, estimate.soft_iron_b @ matrix)
+    return out
+
+
+def _score(
+    columns: Columns, calibrations: dict[str, Calibration], reference: Reference | None, window: Window
+) -> tuple[dict[str, HeadingScore], str | None]:
+    """Scores by name, and the reference's name; nothing where there is no reference."""
+    if reference is None:
+        return {}, None
+    declination = columns.declination_rad
+    unknown = ~np.isfinite(declination)
+    if unknown.all():
+        reference = replace(reference, name=f"{reference.name}, taken as magnetic (declination not known)")
+        declination, unknown = np.zeros(len(declination)), np.zeros(len(declination), dtype=bool)
+    got = score_freeze(
+        columns.boot_s,
+        columns.sensor_b_mg,
+        calibrations,
+        np.where(unknown, 0.0, declination),
+        reference,
+        window,
+        {"declination not known": unknown},
+    )
+    return got, reference.name
+
+
+def _row(
+    o: Outcome, columns: Columns, matrix: Floats, second: HeadingScore | None, whole: HeadingScore | None
+) -> Result:
+    """One line of the table."""
+    e = o.whole
+    row: Result = {"name": o.name, "state": o.state, "reasons": list(o.reasons), "refusal": o.refusal}
+    row |= {"us_per_sample": round(o.us_per_sample, 2), "samples": 0 if e is None else e.samples}
+    row |= dict.fromkeys(("offsets_mg", "sigma_mg", "soft_iron", "residual_mg", "length_rms_mg"))
+    row |= {"second_half": _heading(second), "in_sample": _heading(whole)}
+    if e is None:
+        return row
+    sigma = np.sqrt(np.maximum(np.diag(e.covariance_mg2), 0.0))
+    says = sigma < UNKNOWN_MG if o.has_sigma else np.ones(3, dtype=bool)
+    corrected = (columns.sensor_b_mg[columns.learn] - e.hard_iron_b_mg) @ (e.soft_iron_b @ matrix).T
+    length = np.linalg.norm(corrected, axis=1)
+    row["offsets_mg"] = [round(-float(v), 2) if s else None for v, s in zip(e.hard_iron_b_mg, says, strict=True)]
+    row["sigma_mg"] = (
+        [round(float(v), 2) if s else None for v, s in zip(sigma, says, strict=True)] if o.has_sigma else None
+    )
+    row["soft_iron"] = None if np.array_equal(e.soft_iron_b, np.eye(3)) else e.soft_iron_b.round(4).tolist()
+    row["residual_mg"] = round(e.residual_mg, 2)
+    row["length_rms_mg"] = round(float(length.std()), 2) if len(length) and bool(says.all()) else None
+    return row
+
+
+def _heading(score: HeadingScore | None) -> Result | None:
+    if score is None:
+        return None
+    return {k: getattr(score, k) for k in ("rms_deg", "p95_deg", "bias_deg", "n", "from_s", "to_s", "excluded")}

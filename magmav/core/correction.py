@@ -1,0 +1,123 @@
+"""What an estimate makes of one sample: the corrected field and the heading, for compasses of three axes and of two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from magmav.core.dip import dip_from_model
+from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
+from magmav.core.heading import UNKNOWN, heading
+from magmav.core.rotation import euler_rates, wrap_tau
+from magmav.core.two_axis import Doubts, down_from_dip, heading_of_two_axes, vertical_component
+from magmav.core.types import Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
+
+_WEAKEST_MG = 20.0  # a circle smaller than this is none
+
+
+def corrected_field(s: Sample, e: Estimate, expected: ExpectedField | None) -> Vec3:
+    """soft iron (A (m - b) + motor), (3,) mG, body axes. Of a two-axis compass the third is reckoned from the dip.
+
+    Where that cannot be (no position, or beyond 60 degrees of tilt) it is 0.
+    """
+    field: Vec3 = e.soft_iron_b @ (s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg)
+    return field if s.axes == 3 else with_third(field, s, _radius(e, expected), expected)
+
+
+def with_third(field_b_mg: Vec3, s: Sample, radius_mg: float, expected: ExpectedField | None) -> Vec3:
+    """The field of a two-axis compass with its third component (Sytnyk et al. 2014, Z_ES), or with 0 there."""
+    down: float | None = None
+    if expected is not None and expected.horizontal_mg >= _WEAKEST_MG:
+        x, y, _ = field_b_mg.tolist()
+        v = down_from_dip(max(radius_mg, _WEAKEST_MG), dip_from_model(expected))
+        down = vertical_component(x, y, s.roll_rad, s.pitch_rad, v)
+    out: Vec3 = np.array([field_b_mg[0], field_b_mg[1], down or 0.0])
+    return out
+
+
+def _radius(e: Estimate, expected: ExpectedField | None) -> float:
+    """Of the calibrated circle; before it is known, what the model says."""
+    return e.horizontal_mg if expected is None or e.horizontal_mg >= _WEAKEST_MG else expected.horizontal_mg
+
+
+def covariance_of_field(s: Sample, e: Estimate) -> Mat3:
+    """What the estimate's doubt is worth in the corrected field, (3, 3) mG^2, body axes."""
+    by = e.soft_iron_b @ s.shaping.matrix
+    out: Mat3 = by @ e.covariance_mg2 @ by.T
+    if s.axes == 2:
+        out[2, :] = out[:, 2] = 0.0  # the third component is not measured
+    return out
+
+
+def field_of(e: Estimate, expected: ExpectedField | None) -> tuple[float, float]:
+    """Horizontal and downward field, mG: the model's, or what the data imply."""
+    if expected is not None:
+        return expected.horizontal_mg, expected.down_mg
+    return e.horizontal_mg, e.down_mg
+
+
+def published(
+    s: Sample,
+    field_b_mg: Vec3,
+    radius_mg: float,
+    covariance_b_mg2: Mat3,
+    sigma_rad: float,
+    tilt_sigma_rad: float,
+    expected: ExpectedField | None,
+) -> Heading:
+    """The heading at the time of measurement. ``sigma_rad`` is that of three axes; two axes reckon their own.
+
+    Two axes without a position have no dip, hence no heading.
+    """
+    declination = None if expected is None else expected.declination_rad
+    if s.axes == 3:
+        return heading(field_b_mg, s.roll_rad, s.pitch_rad, sigma_rad, declination)
+    if expected is None or expected.horizontal_mg < _WEAKEST_MG:
+        return UNKNOWN
+    dip_sigma = MODEL_SIGMA_MG / expected.total_mg
+    doubts = Doubts(covariance_b_mg2[:2, :2], dip_sigma, tilt_sigma_rad, MODEL_SIGMA_MG)
+    x, y, _ = field_b_mg.tolist()
+    radius, dip = max(radius_mg, _WEAKEST_MG), dip_from_model(expected)
+    return heading_of_two_axes(x, y, s.roll_rad, s.pitch_rad, radius, dip, doubts, declination)
+
+
+def turned_on(s: Sample, delay_s: float, h: Heading) -> Heading:
+    """The heading of the measurement, turned on to the time of the message by the gyro."""
+    lead = s.lead_rad + delay_s * euler_rates(s.roll_rad, s.pitch_rad, s.rate_b_rads)[2]
+    return replace(h, magnetic_rad=wrap_tau(h.magnetic_rad + lead), true_rad=wrap_tau(h.true_rad + lead))
+
+
+def stored_heading(s: Sample, sent_b_mg: Vec3, expected: ExpectedField | None) -> Heading:
+    """The heading of the stream as the autopilot corrects it. Its sigma is not known: pi."""
+    covariance = np.eye(3) * 1e6
+    radius = 0.0 if expected is None else expected.horizontal_mg
+    h = published(s, sent_b_mg, radius, covariance, math.pi, 0.0, expected)
+    return replace(h, sigma_rad=math.pi) if h.valid else h
+
+
+def without_third(undo: Callable[[Vec3], Vec3], shaping: Shaping) -> tuple[Callable[[Vec3], Vec3], Shaping]:
+    """The autopilot's correction and its inverse for two axes: no third component takes part, in or out.
+
+    undo(m) = L (m - motor) - offset in three axes. What a stored matrix mixes in from the third axis is not known here
+    and taken as nothing.
+    """
+    motor = shaping.motor_b_mg
+    offset = -undo(motor)
+    columns = [undo(vec3(motor + unit, "field")) + offset for unit in np.eye(3)]
+    inverse = np.linalg.inv(_two(np.linalg.inv(np.column_stack(columns))))
+    level = np.array([1.0, 1.0, 0.0])
+
+    def two(sent_b_mg: Vec3) -> Vec3:
+        return vec3(level * (inverse @ (sent_b_mg - motor) - offset), "field")
+
+    return two, Shaping(mat3(_two(shaping.matrix), "matrix"), vec3(level * motor, "motor term"))
+
+
+def _two(matrix: Mat3) -> Mat3:
+    """Upper left block, and 1 for the third."""
+    out = np.eye(3)
+    out[:2, :2] = matrix[:2, :2]
+    return out
