@@ -81,6 +81,13 @@ def parser() -> argparse.ArgumentParser:
     replay.add_argument("--reference", type=Path, metavar="CSV", help="truth file instead of ATTITUDE yaw")
     replay.add_argument("--plot", type=Path, metavar="PNG", help="offsets, heading errors and field cloud")
 
+    compare = add("compare", "every estimator on one recording or simulated flight, side by side", place=True)
+    compare.add_argument("log", type=Path, metavar="LOG", help="a .tlog, .bin, .log or .ulg, or a scenario's name")
+    compare.add_argument("--reference", type=Path, metavar="CSV", help="truth file instead of the recording's own yaw")
+    compare.add_argument("--only", metavar="NAMES", help="estimators, comma between; default all")
+    compare.add_argument("--plot", type=Path, metavar="PNG", help="circles and spheres over the points")
+    compare.add_argument("--seed", type=int, metavar="N", help="of a scenario, instead of its own")
+
     upload = add("upload", "write what was learnt to the vehicle, prove it, or show what would be sent", store=True)
     _link(upload)
     _write_options(upload)
@@ -153,7 +160,7 @@ def _guarded(options: argparse.Namespace) -> int:
     except (LogError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError) as error:
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
-        return fail(INPUT if options.command == "replay" else PORT, str(error), options.json)
+        return fail(INPUT if options.command in ("replay", "compare") else PORT, str(error), options.json)
     except (NoVehicle, DemoError) as error:
         return fail(PORT, str(error), options.json)
     except Refused as error:

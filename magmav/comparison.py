@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,6 +75,7 @@ class Columns:
     roll_rad: Floats
     pitch_rad: Floats
     learn: NDArray[np.bool_]
+    down_mg: float | None  # of a two-axis compass: the Earth's downward field that stands in for its third
     declination_rad: Floats  # NaN where no position was known
 
     @classmethod
@@ -93,6 +94,7 @@ class Columns:
             np.array([s.roll_rad for s in samples]),
             np.array([s.pitch_rad for s in samples]),
             np.array([s.learn for s in samples], dtype=bool),
+            expected[-1].down_mg if samples[-1].axes == 2 and expected[-1] is not None else None,
             np.array([math.nan if e is None else e.declination_rad for e in expected]),
         )
 
@@ -261,14 +263,10 @@ def _compass(
         "learnt_to_s": float(columns.boot_s[taught[-1]]) if len(taught) else None,
         "split_s": split_s,
         "reference": name,
-        "uncalibrated": {"second_half": _heading(second.get("uncalibrated")), "in_sample": _heading(whole.get("uncalibrated"))},
+        "uncalibrated": _both(second.get("uncalibrated"), whole.get("uncalibrated")),
         "stored": None
         if stored is None
-        else {
-            "offsets_mg": [float(v) for v in stored],
-            "second_half": _heading(second.get("stored")),
-            "in_sample": _heading(whole.get("stored")),
-        },
+        else {"offsets_mg": stored.tolist(), **_both(second.get("stored"), whole.get("stored"))},
         "estimators": rows,
     }  # fmt: skip
 
@@ -303,6 +301,7 @@ def _score(
         reference,
         window,
         {"declination not known": unknown},
+        columns.down_mg,
     )
     return got, reference.name
 
@@ -315,7 +314,7 @@ def _row(
     row: Result = {"name": o.name, "state": o.state, "reasons": list(o.reasons), "refusal": o.refusal}
     row |= {"us_per_sample": round(o.us_per_sample, 2), "samples": 0 if e is None else e.samples}
     row |= dict.fromkeys(("offsets_mg", "sigma_mg", "soft_iron", "residual_mg", "length_rms_mg"))
-    row |= {"second_half": _heading(second), "in_sample": _heading(whole)}
+    row |= _both(second, whole)
     if e is None:
         return row
     sigma = np.sqrt(np.maximum(np.diag(e.covariance_mg2), 0.0))
@@ -332,7 +331,8 @@ def _row(
     return row
 
 
-def _heading(score: HeadingScore | None) -> Result | None:
-    if score is None:
-        return None
-    return {k: getattr(score, k) for k in ("rms_deg", "p95_deg", "bias_deg", "n", "from_s", "to_s", "excluded")}
+def _both(second: HeadingScore | None, whole: HeadingScore | None) -> Result:
+    def entry(score: HeadingScore | None) -> Result | None:
+        return None if score is None else {k: v for k, v in asdict(score).items() if k != "reference"}
+
+    return {"second_half": entry(second), "in_sample": entry(whole)}

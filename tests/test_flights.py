@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from magmav.cli import main
-from magmav.commands import finite
+from magmav.commands.common import finite
 from magmav.geomag import world_magnetic_model
 from magmav.recording import open_recording, replay
 from magmav.settings import Settings

@@ -1,0 +1,73 @@
+"""What every command does alike: settings from options, results to standard output, progress to standard error."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import msgspec
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from magmav.settings import Settings, checked, load
+
+Result = dict[str, Any]
+
+
+class Refused(Exception):
+    """An action that was asked for and not done."""
+
+
+def settings_of(o: argparse.Namespace) -> Settings:
+    settings = load(o.config)
+    for option, section, key in (
+        ("system", "vehicle", "system"),
+        ("lat", "place", "lat_deg"),
+        ("lon", "place", "lon_deg"),
+        ("alt", "place", "alt_m"),
+    ):
+        value = getattr(o, option, None)
+        if value is not None:
+            part = msgspec.structs.replace(getattr(settings, section), **{key: value})
+            settings = msgspec.structs.replace(settings, **{section: part})
+    settings = msgspec.convert(msgspec.to_builtins(settings), Settings)
+    return checked(settings, "command line")
+
+
+def show(o: argparse.Namespace, result: Result, view: Callable[[Any], RenderableType]) -> None:
+    if o.json:
+        sys.stdout.write(json.dumps(finite(result)) + "\n")
+    else:
+        width = None if sys.stdout.isatty() else 120  # a pipe has no width of its own
+        Console(file=sys.stdout, highlight=False, width=width).print(view(result))
+
+
+def finite(value: Any) -> Any:
+    """The same tree with every number that is not finite as None: JSON knows no NaN."""
+    if isinstance(value, dict):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def stderr_console() -> Console:
+    return Console(stderr=True, highlight=False)
+
+
+def progress_bar(stack: ExitStack, name: str) -> Callable[[int, int], None] | None:
+    """A bar on standard error, where somebody watches."""
+    if not sys.stderr.isatty():
+        return None
+    bar = stack.enter_context(
+        Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=stderr_console())
+    )
+    task = bar.add_task(name)
+    return lambda done, total: bar.update(task, completed=done, total=total)

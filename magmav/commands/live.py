@@ -1,0 +1,175 @@
+"""Commands on a live link: run, upload, restore; and history, what they left on record."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any
+
+from magmav.commands.common import Refused, Result, settings_of, show, stderr_console
+from magmav.core.types import Change, Reading, Reason, Record
+from magmav.geomag import world_magnetic_model
+from magmav.link import Link, LinkError
+from magmav.settings import SettingsError, with_value
+
+_log = logging.getLogger("magmav")
+
+
+@contextmanager
+def _until_signal(link: Link) -> Iterator[Callable[[], bool]]:
+    """SIGTERM and Ctrl-C end the work cleanly: one more turn, then last words."""
+    hit: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        hit.append(number)
+
+    before = {n: signal.signal(n, stop) for n in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield lambda: bool(hit)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        link.close()
+
+
+def run(o: argparse.Namespace) -> int:
+    """The service, until stopped."""
+    from magmav.link.open import open_link
+    from magmav.link.recorder import TlogRecorder
+    from magmav.live import Session
+    from magmav.store import Store, default_path
+    from magmav.view.records import RecordWriter
+    from magmav.view.reporter import Reporter
+
+    settings = settings_of(o)
+    if o.no_requests:
+        for key in ("imu_hz", "attitude_hz", "slow_hz"):
+            settings = with_value(settings, "wire", key, 0.0)
+    with ExitStack() as stack:
+        store = stack.enter_context(Store(o.store or default_path()))
+        link: Link = _live(o.link, open_link)
+        if o.record is not None:
+            link = TlogRecorder(link, o.record)
+        stopped = stack.enter_context(_until_signal(link))
+        watchers: list[Callable[[Reading, Record | None], None]] = [Reporter(o.json)]
+        if o.records is not None:
+            writer = stack.enter_context(RecordWriter(o.records))
+            watchers.append(lambda reading, record: None if record is None else writer.write(record))
+        session = Session.on(link, settings, world_magnetic_model, store, watchers)
+        _warn(link)
+        port = getattr(link, "port", None)
+        _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {port})" if port else "")
+        until = _Deadline(o.for_s)
+        session.service.run(lambda: stopped() or until(session.service.now_ns))
+    return 0
+
+
+class _Deadline:
+    """True once so many seconds of link time have passed."""
+
+    def __init__(self, for_s: float | None) -> None:
+        self._for_ns = math.inf if for_s is None else for_s * 1e9
+        self._first_ns: int | None = None
+
+    def __call__(self, now_ns: int) -> bool:
+        self._first_ns = now_ns if self._first_ns is None else self._first_ns
+        return now_ns - self._first_ns >= self._for_ns
+
+
+def _live(text: str, open_link: Callable[..., Link]) -> Link:
+    """A live link; a recording is no place to send anything to (S15)."""
+    if text.lower().endswith((".tlog", ".bin", ".log", ".ulg")):
+        raise LinkError(f"{text}: a recording is not a live link; use `magmav replay`")
+    return open_link(text)
+
+
+def _warn(link: Link) -> None:
+    warning = getattr(link, "warning", "")
+    if warning:
+        _log.warning("%s", warning)
+
+
+def _transact(o: argparse.Namespace, pick: Callable[[Any, int, int], Any], confirm: int | None) -> Result:
+    from magmav.link.open import open_link
+    from magmav.live import Session, transact
+    from magmav.store import Store, default_path
+
+    settings = settings_of(o)
+    with ExitStack() as stack:
+        store = stack.enter_context(Store(o.store or default_path()))
+        link = _live(o.link, open_link)
+        stopped = stack.enter_context(_until_signal(link))
+        _warn(link)
+        session = Session.on(link, settings, world_magnetic_model, store, ask=False)
+        say = stderr_console()
+        return transact(
+            session,
+            link,
+            o.compass,
+            lambda device: pick(store, session.companion.presence.system, device),
+            confirm=confirm,
+            dry=o.dry_run,
+            wait_s=o.wait,
+            progress=lambda text: say.print(text),
+            stop=stopped,
+        )
+
+
+def upload(o: argparse.Namespace) -> int:
+    """Write what was learnt, with proof."""
+    from magmav.saved_result import NotReady, change_from_result
+
+    try:
+        given = None if o.source is None else change_from_result(o.source, o.compass)
+    except NotReady as error:
+        raise Refused(str(error)) from None
+
+    def pick(store: Any, system: int, device: int) -> Change | Reason:
+        if given is not None:
+            return given
+        saved = store.latest_estimate(system, device)
+        return Reason.NO_CALIBRATION if saved is None else saved.change
+
+    return _ended(o, _transact(o, pick, o.confirm_change), ("ALL_NEW",))
+
+
+def restore(o: argparse.Namespace) -> int:
+    """Undo the last upload."""
+
+    def pick(store: Any, system: int, device: int) -> Any:
+        return store.last_restorable(system, o.compass, device) or Reason.NO_SNAPSHOT
+
+    return _ended(o, _transact(o, pick, None), ("ALL_OLD",))
+
+
+def _ended(o: argparse.Namespace, result: Result, good: tuple[str, ...]) -> int:
+    from magmav.view.table import write_view
+
+    show(o, result, write_view)
+    return 0 if result.get("dry_run") or result.get("result") in good else 1
+
+
+def history(o: argparse.Namespace) -> int:
+    """Every write on record."""
+    from magmav.live import history_entry
+    from magmav.store import Store, default_path
+    from magmav.view.table import history_view
+
+    if o.limit < 1:
+        raise SettingsError(f"--limit: want 1 or more, got {o.limit}")
+    path = o.store or default_path()
+    rows: list[Result] = []
+    if path.exists():
+        with Store(path) as store:
+            if o.dismiss is not None:
+                if o.dismiss not in {row.id for row in store.pending()}:
+                    raise Refused(f"{path}: no write {o.dismiss} waits to be undone")
+                store.dismiss(o.dismiss)
+            rows = [history_entry(row) for row in store.history(o.limit)]
+    show(o, {"store": str(path), "writes": rows}, lambda result: history_view(result["writes"]))
+    return 0

@@ -1,0 +1,123 @@
+"""Commands on recordings: replay and compare."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from magmav.commands.common import Refused, progress_bar, settings_of, show, stderr_console
+from magmav.core.types import Reading, Record
+from magmav.geomag import world_magnetic_model
+from magmav.settings import SettingsError
+
+
+def replay(o: argparse.Namespace) -> int:
+    """A recording through the pipeline."""
+    from magmav.recording import open_recording
+    from magmav.recording import replay as run
+    from magmav.view.records import RecordWriter
+    from magmav.view.table import replay_view
+    from magmav.view.timeline import Timeline
+
+    if o.learn_for is not None and not o.learn_for > 0.0:
+        raise SettingsError(f"--learn-for: want seconds above 0, got {o.learn_for:g}")
+    if o.every is not None and not o.every > 0.0:
+        raise SettingsError(f"--every: want seconds above 0, got {o.every:g}")
+    settings = settings_of(o)
+    with ExitStack() as stack:
+        progress = progress_bar(stack, o.log.name)
+        recording = open_recording(o.log, progress)
+        stack.callback(recording.close)
+        watchers: list[Callable[[Reading, Record | None], None]] = []
+        if o.records is not None:
+            writer = stack.enter_context(RecordWriter(o.records))
+            watchers.append(lambda reading, record: None if record is None else writer.write(record))
+        traces = None
+        if o.plot is not None:
+            from magmav.view.plots import TraceCollector
+
+            traces = TraceCollector()
+            watchers.append(lambda reading, record: None if record is None else traces.add(record))
+        references: dict[int, Any] = {}
+        timeline = Timeline(o.every) if o.every is not None else None
+        if timeline is not None:
+            watchers.append(timeline)
+        result = run(
+            recording,
+            settings,
+            world_magnetic_model,
+            source=str(o.log),
+            learn_for_s=o.learn_for,
+            reference_csv=o.reference,
+            watchers=watchers,
+            references=references,
+        )
+    if timeline is not None:
+        result["timeline"] = timeline.rows
+    if traces is not None:
+        from magmav.picture import draw_replay
+
+        draw_replay(o.plot, traces.traces(), result, references)
+    if timeline is not None and not o.json:
+        for line in timeline.lines():
+            sys.stdout.write(line + "\n")
+    show(o, result, replay_view)
+    return 0
+
+
+def compare(o: argparse.Namespace) -> int:
+    """Every estimator on one recording, or on one simulated flight."""
+    from magmav_sim.scenario_file import scenario_files
+
+    from magmav.comparison import compare as run
+    from magmav.recording import open_recording
+    from magmav.view.compare import compare_view
+
+    settings = settings_of(o)
+    only = [] if o.only is None else [name.strip() for name in o.only.split(",")]
+    with ExitStack() as stack:
+        path, truth = o.log, o.reference
+        if not path.exists() and path.name in scenario_files():
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="magmav-compare-")))
+            path, truth = flown(path.name, folder, o.seed)
+        recording = open_recording(path, progress_bar(stack, o.log.name))
+        stack.callback(recording.close)
+        console = stderr_console()
+        tapes: Any = {} if o.plot is not None else None
+        result = run(
+            recording,
+            settings,
+            world_magnetic_model,
+            clock=time.perf_counter,
+            source=str(o.log),
+            reference_csv=truth,
+            only=only,
+            progress=lambda text: console.print(text, style="dim"),
+            tapes=tapes,
+        )
+    if o.plot is not None:
+        from magmav.view.plot_compare import Cloud, plot_compare
+
+        clouds = {
+            key: Cloud(c.sensor_b_mg[c.learn], c.roll_rad[c.learn], c.pitch_rad[c.learn]) for key, c in tapes.items()
+        }
+        plot_compare(o.plot, result, clouds)
+    show(o, result, compare_view)
+    return 0
+
+
+def flown(scenario: str, folder: Path, seed: int | None) -> tuple[Path, Path]:
+    """A simulated flight on file: the recording, and its truth as a reference file."""
+    from magmav_sim.__main__ import main as simulate
+
+    path = folder / f"{scenario}.tlog"
+    words = [scenario, "--write", str(path), "--truth", str(folder)]
+    if simulate(words if seed is None else [*words, "--seed", str(seed)]) != 0:
+        raise Refused(f"{scenario}: the simulated flight could not be flown")
+    return path, folder / "truth.csv"
