@@ -34,13 +34,15 @@ def imports(name: str) -> Iterator[str]:
                 yield full if full in SOURCES else base
 
 
+CORE_FOR_READERS = ("magmav.core.types", "magmav.core.reasons", "magmav.core.rotation", "magmav.core.orientation")
+
 # Package: what it may import of ours, and of others' (None: anything installed).
 STOREYS = {
     "magmav.core": (("magmav.core",), ("numpy", "filterpy")),
     "magmav.link": (("magmav.link",), None),
     # core.reasons is the part of core.types that holds the one vocabulary.
-    "magmav.mavlink": (("magmav.mavlink", "magmav.core.types", "magmav.core.reasons", "magmav.core.rotation"), None),
-    "magmav.logs": (("magmav.logs", "magmav.core.types", "magmav.core.reasons", "magmav.core.rotation"), None),
+    "magmav.mavlink": (("magmav.mavlink", *CORE_FOR_READERS), None),
+    "magmav.logs": (("magmav.logs", *CORE_FOR_READERS), None),
     "magmav.view": (("magmav.view", "magmav.core.types", "magmav.core.reasons"), None),
     "magmav_sim": (("magmav_sim", "magmav.link", "magmav.mavlink.codec"), None),
 }

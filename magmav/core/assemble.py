@@ -25,7 +25,7 @@ _SOURCE_SILENT_NS = 2_000_000_000
 _REFRESH_S = 0.1  # ArduPilot's refresh; a slower stream only shows it more rarely
 _AVERAGED_S = 0.07
 # PX4's logs stamp a value with the time it was measured, so it has no age.
-_STAMPED = frozenset({"sensor_mag", "vehicle_magnetometer", "sensor_combined"})
+_STAMPED = frozenset({"sensor_mag", "vehicle_magnetometer", "vehicle_magnetometer less bias", "sensor_combined"})
 _PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")
 
 
@@ -104,13 +104,17 @@ def _follow(mean_s: float, now_s: float) -> float:
 
 
 class Assembler:
-    """One vehicle's readings to Samples. ``counts`` says what was dropped and why."""
+    """One vehicle's readings to Samples. ``counts`` says what was dropped and why.
 
-    def __init__(self, system: int) -> None:
+    own : what gives the tilt where no attitude comes, see core.motion.
+    """
+
+    def __init__(self, system: int, own: str = "complementary") -> None:
         self.system = system
+        self._own = own
         self.counts: Counter[str] = Counter()
         self.clock = BootClock()
-        self.motion = Motion()
+        self.motion = Motion(own)
         self.reboots = 0
         self._compasses: dict[int, _Compass] = {}
 
@@ -198,7 +202,7 @@ class Assembler:
             return False
         if tick is Tick.REBOOT:
             self.reboots += 1
-        self.motion = Motion()
+        self.motion = Motion(self._own)
         self._compasses.clear()
         return True
 

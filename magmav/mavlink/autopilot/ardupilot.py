@@ -26,14 +26,12 @@ from magmav.core.types import (
     mat3,
     vec3,
 )
+from magmav.mavlink.autopilot.stored import StoredCalibrations, invertible
 
 COMPASSES = (1, 2, 3)
 _AXES = ("X", "Y", "Z")
 _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5
 _BY_THROTTLE, _BY_CURRENT = 1, 2
-_MOST_MG = 32767.0  # what RAW_IMU can carry
-_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0
-"""Of a matrix worth undoing, in every direction. Real ones lie within 0.5 to 1.5; at 0.05 noise grows twentyfold."""
 
 
 def _suffix(compass: int) -> str:
@@ -108,6 +106,12 @@ class Calibrations:
         offset, mode = self.offsets(compass), get("COMPASS_MOTCT", 0.0)
         motor = tuple(get(f"COMPASS_MOT{n}_{a}", 0.0) for a in _AXES) if mode else ()
         return (None if offset is None else tuple(offset), self._matrix(compass).tobytes(), mode, motor)
+
+    def sensor(self, compass: int, device_id: int, source: str) -> None:
+        """ArduPilot's compasses are known by their number."""
+
+    def armed(self, armed: bool) -> None:
+        """Armed or not, ArduPilot corrects alike."""
 
     def throttle(self, share: float) -> None:
         """Take the throttle, 0 to 1."""
@@ -224,13 +228,9 @@ class Calibrations:
         return self._answer("undoable", compass, self._is_undoable)
 
     def _is_undoable(self, compass: int) -> bool:
-        offset, shaping = self._parts_of(compass)
-        if max(abs(offset).max(), abs(shaping.motor_b_mg).max()) > _MOST_MG:
-            return False
-        values = np.linalg.svd(shaping.matrix, compute_uv=False) if shaping is not NO_SHAPING else (1.0,)
-        return bool(values[0] < _MOST_GAIN and values[-1] > _LEAST_GAIN)
+        return invertible(*self._parts_of(compass))
 
-    def undo(self, compass: int, sent_b_mg: Vec3) -> Vec3:
+    def undo(self, compass: int, sent_b_mg: Vec3, source: str = "") -> Vec3:
         """The sensor's own field, mG, body axes, from the field as sent. ValueError for a singular stored matrix."""
         offset, shaping = self._parts_of(compass)
         if shaping is NO_SHAPING:
@@ -241,9 +241,13 @@ class Calibrations:
             raise ValueError(f"compass {compass}: stored DIA/ODI matrix is singular and cannot be undone") from None
         return vec3(inner - offset, "field")
 
+    def corrected(self, compass: int, sent_b_mg: Vec3, source: str = "") -> Vec3:
+        """The field as the autopilot uses it: all of ArduPilot's messages carry that."""
+        return sent_b_mg
+
 
 def plan_change(
-    held: Calibrations,
+    held: StoredCalibrations,
     system: int,
     compass: int,
     hard_iron_b_mg: Vec3,

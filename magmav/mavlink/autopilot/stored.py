@@ -1,0 +1,99 @@
+"""What every autopilot's stored compass calibration must answer, whatever it calls it and however it counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+import numpy as np
+
+from magmav.core.types import NO_SHAPING, ParamReading, Shaping, Vec3
+
+_MOST_MG = 32767.0  # what RAW_IMU can carry
+_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0
+"""Of a matrix worth undoing, in every direction. Real ones lie within 0.5 to 1.5; at 0.05 noise grows twentyfold."""
+
+
+def invertible(offset_b_mg: Vec3, shaping: Shaping) -> bool:
+    """False for a correction that throws a direction away, or is larger than a stream could carry."""
+    if max(abs(offset_b_mg).max(), abs(shaping.motor_b_mg).max()) > _MOST_MG:
+        return False
+    values = np.linalg.svd(shaping.matrix, compute_uv=False) if shaping is not NO_SHAPING else (1.0,)
+    return bool(values[0] < _MOST_GAIN and values[-1] > _LEAST_GAIN)
+
+
+class StoredCalibrations(Protocol):
+    """What one vehicle holds for its compasses, as far as it has been heard, and how to undo it.
+
+    Inside, the autopilot's own names, units, signs and axes; outside, offsets to be added, mG, body axes, with
+    truth = shaping.matrix @ (sensor + offsets) + shaping.motor_b_mg, where sensor is the sensor's own field turned
+    into body axes. ``epoch(compass)`` grows whenever data before and after must not be mixed.
+    """
+
+    def param(self, r: ParamReading) -> tuple[int, ...]:
+        """Take one parameter; the compasses whose correction it changed."""
+        ...
+
+    def sensor(self, compass: int, device_id: int, source: str) -> None:
+        """This compass's readings come from this device (0: not said), through this message."""
+        ...
+
+    def armed(self, armed: bool) -> None:
+        """Take the arm state."""
+        ...
+
+    def throttle(self, share: float) -> None:
+        """Take the throttle, 0 to 1."""
+        ...
+
+    def current(self, ampere: float) -> None:
+        """Take the battery current."""
+        ...
+
+    def expect(self, names: Iterable[str], values: Iterable[float]) -> None:
+        """These coming values are our own doing: undone exactly, nothing need be learnt again."""
+        ...
+
+    def known(self, compass: int) -> bool:
+        """True when stored offsets and device id were heard, so that results are absolute."""
+        ...
+
+    def assumed(self, compass: int) -> bool:
+        """True when scale, matrix or motor terms (or what drives the motor term) are the autopilot's defaults."""
+        ...
+
+    def epoch(self, compass: int) -> int:
+        """Number of the stretch of data over which this compass was corrected in one way."""
+        ...
+
+    def changed(self, compass: int) -> bool:
+        """True when somebody changed the correction after it was known."""
+        ...
+
+    def device_id(self, compass: int) -> int:
+        """Device id, 0 when not known."""
+        ...
+
+    def offsets(self, compass: int) -> Vec3 | None:
+        """Stored offsets as ArduPilot would add them, mG, body axes, or None."""
+        ...
+
+    def stored(self, compass: int) -> dict[str, float]:
+        """Every value heard for this compass, in the autopilot's own names and units."""
+        ...
+
+    def shaping(self, compass: int) -> Shaping:
+        """What the autopilot does after its offsets."""
+        ...
+
+    def undoable(self, compass: int) -> bool:
+        """False where what is stored cannot be undone."""
+        ...
+
+    def undo(self, compass: int, sent_mg: Vec3, /, source: str = "") -> Vec3:
+        """The sensor's own field, mG, body axes, from the field as sent. ValueError for a singular stored matrix."""
+        ...
+
+    def corrected(self, compass: int, sent_mg: Vec3, /, source: str = "") -> Vec3:
+        """The field as the autopilot uses it, mG, body axes, from the field as sent."""
+        ...
