@@ -1,4 +1,7 @@
-"""``python -m magmav_sim SCENARIO --to LINK``: a simulated vehicle for any ground station or companion."""
+"""``python -m magmav_sim SCENARIO --to LINK``: a simulated vehicle for any ground station or companion.
+
+``--write FILE...`` keeps the flight as .tlog, .bin, .log or .ulg; without ``--to`` it flies as fast as it can.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from typing import NoReturn
 
 from magmav.link import Link, LinkError
 from magmav.link.open import open_link
+from magmav_sim.recorder import Recorder, kinds, recordable, unattended
 from magmav_sim.scenario import ScenarioError
 from magmav_sim.scenario_file import load_scenario, scenario_files
 from magmav_sim.serve import serve
@@ -23,37 +27,64 @@ from magmav_sim.vehicle import Simulation
 
 _WRONG, _NO_INPUT, _NO_LINK = 2, 3, 4
 _TICK_S = 0.01
+_STRIDE_S = 0.02
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 flown or stopped, 2 wrong arguments, 3 no usable scenario or truth directory, 4 link."""
+    """Exit code: 0 flown or stopped, 2 wrong arguments, 3 no usable scenario, or nowhere to write, 4 link."""
     words = list(sys.argv[1:] if argv is None else argv)
+    parser = _parser("--json" in words)
     try:
-        options = _parser("--json" in words).parse_args(words)
+        options = parser.parse_args(words)
+        if options.to is None and not options.write:
+            parser.error("want --to LINK, --write FILE or both")
     except SystemExit as leave:  # the parser has said what is wrong, or printed the help
         return _WRONG if leave.code else 0
     try:
-        simulation = Simulation(load_scenario(options.scenario), options.seed)
+        scenario = load_scenario(options.scenario)
+        simulation = Simulation(scenario if options.to else unattended(scenario), options.seed)
     except ScenarioError as error:
         return _fail(_NO_INPUT, str(error), options.json)
     try:
-        link = open_link(options.to, tick_s=_TICK_S)
+        link = None if options.to is None else open_link(options.to, tick_s=_TICK_S)
     except LinkError as error:
         return _fail(_NO_LINK, str(error), options.json)
     first = simulation.truth
+    recorder = None
     with ExitStack() as stack:
-        stack.callback(link.close)
         truth = None
+        if link is not None:
+            stack.callback(link.close)
         try:
             if options.truth is not None:
                 truth = stack.enter_context(TruthLog(options.truth, simulation))
         except OSError as error:
             return _fail(_NO_INPUT, f"--truth {options.truth}: {error.strerror}", options.json)
-        stopped = stack.enter_context(_stopped_by_signal(link))
-        serve(link, simulation, options.speed, truth, stopped.is_set)
+        try:
+            if options.write:
+                recorder = stack.enter_context(Recorder(simulation, options.write, fetch=link is None))
+            stopped = stack.enter_context(_stopped_by_signal(link))
+            if link is None:
+                _fly(simulation, truth, stopped)
+            else:
+                serve(link, simulation, options.speed, truth, stopped.is_set)
+        except FileExistsError as error:
+            return _fail(_NO_INPUT, f"--write {error.filename}: is there already; name another file", options.json)
+        except OSError as error:
+            where = error.filename or ", ".join(map(str, options.write))
+            return _fail(_NO_INPUT, f"--write {where}: {error.strerror}", options.json)
     if options.json:
-        sys.stdout.write(json.dumps(summary(simulation, first)) + "\n")
+        written = {} if recorder is None else {"files": [str(path) for path in recorder.files]}
+        sys.stdout.write(json.dumps(summary(simulation, first) | written) + "\n")
     return 0
+
+
+def _fly(simulation: Simulation, truth: TruthLog | None, stopped: threading.Event) -> None:
+    """To the end of the scenario, as fast as it goes."""
+    while not (simulation.finished or stopped.is_set()):
+        simulation.advance(_STRIDE_S)
+        if truth is not None:
+            truth.sample()
 
 
 class _Parser(argparse.ArgumentParser):
@@ -73,7 +104,15 @@ def _parser(as_json: bool) -> argparse.ArgumentParser:
     parser.add_argument("--json", action="store_true", help="at the end, what was true, as JSON")
     known = ", ".join(scenario_files())
     parser.add_argument("scenario", nargs="?", default="demo", help=f"a .toml file, or one of: {known}")
-    parser.add_argument("--to", required=True, metavar="LINK", help="e.g. udpout:127.0.0.1:14550")
+    parser.add_argument("--to", metavar="LINK", help="e.g. udpout:127.0.0.1:14550")
+    parser.add_argument(
+        "--write",
+        type=_recording,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help=f"keep the flight, by the name's ending: {kinds()}; without --to as fast as it can",
+    )
     parser.add_argument(
         "--speed",
         type=_speed,
@@ -102,6 +141,12 @@ def _seed(text: str) -> int:
     return value
 
 
+def _recording(text: str) -> Path:
+    if not recordable(Path(text)):
+        raise argparse.ArgumentTypeError(f"want a name that ends in one of {kinds()}; got {text}")
+    return Path(text)
+
+
 def _fail(code: int, text: str, as_json: bool) -> int:
     if as_json:
         sys.stdout.write(json.dumps({"error": {"code": code, "text": text}}) + "\n")
@@ -111,13 +156,14 @@ def _fail(code: int, text: str, as_json: bool) -> int:
 
 
 @contextmanager
-def _stopped_by_signal(link: Link) -> Iterator[threading.Event]:
-    """An event that SIGTERM and SIGINT set; the link is closed then, so that no wait outlasts them."""
+def _stopped_by_signal(link: Link | None) -> Iterator[threading.Event]:
+    """An event that SIGTERM and SIGINT set; a link is closed then, so that no wait outlasts them."""
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopped.set()
-        link.close()
+        if link is not None:
+            link.close()
 
     if threading.current_thread() is not threading.main_thread():
         yield stopped

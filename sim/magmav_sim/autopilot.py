@@ -25,6 +25,7 @@ class Autopilot:
     """Stepped once a frame with what is true; other modules read its fields.
 
     published_mg : corrected field per compass as last read (10 Hz), mG; zeros where there is none.
+    raw_mg : the same before any correction, mG, the sensor's own axes.  reads : how often they were read.
     outbox : messages to send besides the streams.  ampere is true, measured_ampere what the battery
     monitor says.
     """
@@ -56,6 +57,8 @@ class Autopilot:
         self.throttle = 0.0
         self.battery = Battery(quad=self.quad, seed=seed)
         self.published_mg: list[Vector] = [(0.0, 0.0, 0.0)] * len(world.sensors)
+        self.raw_mg: list[Vector | None] = [None] * len(world.sensors)
+        self.reads = 0
         self._corrections: list[Correction] = []
         self._swapped: set[DeviceId] = set()
         self._frame = 0
@@ -161,6 +164,7 @@ class Autopilot:
 
     def _read(self) -> None:
         """The 10 Hz task: battery monitor and compasses."""
+        self.reads += 1
         self.throttle = self.state.throttle
         self.battery.read(READ_S)
         self._swap_devices()
@@ -168,7 +172,7 @@ class Autopilot:
             count = len(self.published_mg)
             self._corrections = [stored_correction(self.parameters, n + 1) for n in range(count)]
         for i, sensor in enumerate(self._world.sensors):
-            raw = sensor.read()
+            raw = self.raw_mg[i] = sensor.read()
             self.published_mg[i] = (
                 (0.0, 0.0, 0.0)
                 if raw is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -39,6 +40,7 @@ class Truth(NamedTuple):
 class Simulation:
     """One scenario being flown. Same scenario, seed and received bytes at the same times: the same bytes out.
 
+    watchers : called after every frame of 10 ms with the frames it sent; they change nothing.
     seed replaces the scenario's own when given. ScenarioError when names in the scenario are not the
     autopilot's.
     """
@@ -59,6 +61,7 @@ class Simulation:
         self._reboots_ns = sorted(round(f.at_s * 1e9) for f in scenario.faults if isinstance(f, Reboot))
         self._owed_ns = 0
         self.elapsed_ns = 0
+        self.watchers: list[Callable[[list[bytes]], None]] = []
         self.autopilot.step(self.mission.state, 0, busy=False)
 
     @property
@@ -112,7 +115,10 @@ class Simulation:
         while self._owed_ns >= _FRAME_NS and not self.finished:
             self._owed_ns -= _FRAME_NS
             self.elapsed_ns += _FRAME_NS
+            before = len(out)
             self._frame(out)
+            for watch in self.watchers:
+                watch(out[before:])
         return out
 
     def _frame(self, out: list[bytes]) -> None:
