@@ -123,9 +123,9 @@ class MagCompanion:
         if record.system != self.presence.system:
             return
         self._records[record.compass] = record
-        heading = record.heading
+        heading = record.published
         degrees = math.degrees(heading.magnetic_rad) if heading.valid else math.nan
-        self.announcer.heading(record.compass, degrees, record.boot_ns, now_ns)
+        self.announcer.heading(record.compass, degrees, record.published_boot_ns, now_ns)
         if self._states.get(record.compass) is not record.verdict.state:
             self._states[record.compass] = record.verdict.state
             self._say_verdict(record, now_ns)

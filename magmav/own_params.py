@@ -53,17 +53,17 @@ def _headings(board: Board, clock: Callable[[], int]) -> list[Entry]:
     def show(compass: int, pick: Callable[[Record], float | None]) -> Callable[[], float]:
         def get() -> float:
             record = board.record(compass, clock())
-            value = None if record is None or not record.heading.valid else pick(record)
+            value = None if record is None or not record.published.valid else pick(record)
             return math.nan if value is None else math.degrees(value)
 
         return get
 
     out = [
-        Entry("MMAG_HDG", show(1, lambda r: r.heading.magnetic_rad)),
-        Entry("MMAG_HDG_T", show(1, lambda r: r.heading.true_rad if r.heading.true_valid else None)),
-        Entry("MMAG_HDG_SD", show(1, lambda r: r.heading.sigma_rad)),
+        Entry("MMAG_HDG", show(1, lambda r: r.published.magnetic_rad)),
+        Entry("MMAG_HDG_T", show(1, lambda r: r.published.true_rad if r.published.true_valid else None)),
+        Entry("MMAG_HDG_SD", show(1, lambda r: r.published.sigma_rad)),
     ]
-    return out + [Entry(f"MMAG_HDG{c}", show(c, lambda r: r.heading.magnetic_rad)) for c in (2, 3)]
+    return out + [Entry(f"MMAG_HDG{c}", show(c, lambda r: r.published.magnetic_rad)) for c in (2, 3)]
 
 
 def _offsets(board: Board, clock: Callable[[], int]) -> list[Entry]:

@@ -332,6 +332,8 @@ class Record:
     learnt: bool  # this sample moved the estimate
     relative: bool = False  # stored offsets or device id unknown: offsets_mg is a change of whatever is stored
     axes: int = 3  # 2: a two-axis compass; the z of mag_b_mg means nothing, that of corrected_b_mg comes from the dip
+    published: Heading = Heading(False, False, 0.0, 0.0, 0.0)  # what goes out: heading, or smoothed as the settings say
+    published_boot_ns: int = 0  # the time published belongs to
 
 
 # ---------------------------------------------------------------- writing to a vehicle

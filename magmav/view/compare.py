@@ -13,7 +13,7 @@ from rich.text import Text
 Json = Mapping[str, Any]
 _NONE = "-"
 _STATES = {"NO_DATA": "no data", "LEARNING": "learning", "READY": "ready", "REFUSED": "refused"}
-_FOOT = """offset: to be added, mG, body axes; - where the method says nothing of an axis.  fit: its own RMS residual, mG.
+_FOOT = """offset: to be added, mG, body axes; - where a method says nothing of an axis.  fit: its own RMS residual, mG.
 second half: fitted on the first half of the time that taught, heading error scored on the rest, deg.
 in-sample: fitted and scored on everything.  us: microseconds a sample."""
 

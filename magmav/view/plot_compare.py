@@ -1,7 +1,9 @@
 """The points and what each method made of them: circles in the levelled plane, spheres in two cuts of the body.
 
 As in Sawicki's figures: the horizontal field of every sample with the tilt undone, and the circle each method says it
-should lie on. A heading error is the angle between a point seen from the origin and from its circle's centre.
+should lie on. A heading error is the angle between a point seen from the origin and from its circle's centre. Iron is
+fixed to the body, so the levelled circle is blurred where the vehicle tilts; the second picture shows the same points
+with the iron removed first.
 """
 
 from __future__ import annotations
@@ -43,16 +45,16 @@ class Cloud(NamedTuple):
 
 
 def plot_compare(path_png: str | Path, result: Mapping[str, Any], clouds: Mapping[tuple[int, int], Cloud]) -> Figure:
-    """One row of three pictures per compass. ViewError when the file cannot be written."""
+    """One row of four pictures per compass. ViewError when the file cannot be written."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     check_name(path_png)
     entries = [(v["system"], c) for v in result["vehicles"] for c in v["compasses"]]
     with rc_context(STYLE):
-        figure = Figure(figsize=(15.0, 0.6 + 5.6 * len(entries)), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(19.0, 0.6 + 5.2 * len(entries)), dpi=DPI, layout="constrained")
         figure.suptitle(plain(Path(result["source"]).name), fontsize=13, fontweight="bold", x=0.01, ha="left")
-        rows = figure.subplots(len(entries), 3, squeeze=False)
+        rows = figure.subplots(len(entries), 4, squeeze=False)
         for axes, (system, entry) in zip(rows, entries, strict=True):
             _row(list(axes), entry, thinned(clouds[system, entry["compass"]]))
         save(figure, path_png)
@@ -73,13 +75,13 @@ def levelled(field_b_mg: Floats, cloud: Cloud) -> Floats:
 
 
 def _row(axes: list[Axes], entry: Mapping[str, Any], cloud: Cloud) -> None:
-    level, above, beside = axes
+    level, after, above, beside = axes
     raw = levelled(cloud.sensor_b_mg, cloud)
     level.plot(raw[:, 0], raw[:, 1], ".", ms=1.6, mew=0, color=FAINT, label="points")
     x, y, z = cloud.sensor_b_mg.T
     above.plot(y, x, ".", ms=1.6, mew=0, color=FAINT)
     beside.plot(x, z, ".", ms=1.6, mew=0, color=FAINT)
-    shown: list[tuple[Floats, float]] = []
+    last = "no method answered"
     for index, method in enumerate(m for m in entry["estimators"] if m["offsets_mg"] is not None):
         iron = -np.array([0.0 if v is None else v for v in method["offsets_mg"]])
         colour = _COLOURS[index % len(_COLOURS)]
@@ -93,11 +95,16 @@ def _row(axes: list[Axes], entry: Mapping[str, Any], cloud: Cloud) -> None:
         if method["offsets_mg"][2] is not None:
             _ring(above, iron[1], iron[0], total, colour, style)
             _ring(beside, iron[0], iron[2], total, colour, style)
-        shown.append((centre, radius))
+        after.clear()
+        clean = levelled(away, cloud)
+        after.plot(clean[:, 0], clean[:, 1], ".", ms=1.6, mew=0, color=FAINT)
+        _ring(after, 0.0, 0.0, radius, colour, style)
+        last = f"Iron of {method['name']} removed, then levelled"
     for axis, (title, across, up) in zip(
         axes,
         (
             ("Levelled: the circle of headings", "ahead, mG", "right, mG"),
+            (last, "ahead, mG", "right, mG"),
             ("Body, from above: outline of the sphere", "y right, mG", "x forward, mG"),
             ("Body, from the side", "x forward, mG", "z down, mG"),
         ),
