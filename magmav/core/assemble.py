@@ -96,6 +96,11 @@ class _Compass:
         return 0.5 * (_REFRESH_S + min(self.period_s, _REFRESH_S))
 
 
+def _rank(source: str) -> int:
+    """Place in the order of preference; all others, as logs have them, come last and are equal."""
+    return _PREFERENCE.index(source) if source in _PREFERENCE else len(_PREFERENCE)
+
+
 def _follow(mean_s: float, now_s: float) -> float:
     """A slow mean that a single silence does not disturb."""
     if mean_s == 0.0:
@@ -106,7 +111,7 @@ def _follow(mean_s: float, now_s: float) -> float:
 class Assembler:
     """One vehicle's readings to Samples. ``counts`` says what was dropped and why.
 
-    own : what gives the tilt where no attitude comes, see core.motion.
+    own : which of core.motion's OWN_TILTS gives the tilt where no attitude comes.
     """
 
     def __init__(self, system: int, own: str = "complementary") -> None:
@@ -213,7 +218,7 @@ class Assembler:
             known = self._compasses[reading.compass] = _Compass(reading.source, reading.boot_ns)
             return known
         if reading.source != known.source:
-            better = _PREFERENCE.index(reading.source) < _PREFERENCE.index(known.source)
+            better = _rank(reading.source) < _rank(known.source)
             if not better and reading.boot_ns - known.heard_ns < _SOURCE_SILENT_NS:
                 self.counts["mag: same compass in another message"] += 1
                 return None
