@@ -23,6 +23,7 @@ from pyulog.exceptions import ULogException
 from magmav.logs import LogError, Progress
 
 _TELL_EVERY = 1 << 18
+_LONGEST = 1 << 16  # a message is no longer than this
 _MOST_FIELDS = 20_000  # of one message; PX4's largest has some hundreds
 _MOST_EFFORT = 24  # bytes read, per byte of the file: a search through damage goes back again and again
 _FREE_EFFORT = 1 << 26
@@ -30,27 +31,29 @@ _NEAR_US = 60_000_000  # from the middle one of three neighbours; a gap puts non
 _LOG_US = 7 * 86_400_000_000  # no log is longer than a week
 
 
-class _Futile(OSError):
-    """More reading than any whole file needs."""
-
-
 class _Watched(io.BufferedIOBase):
-    """The open file, counting what is read of it."""
+    """The open file, counting what is read of it.
+
+    It ends where only zeros follow (a card fills a file it never finished with them), and once more was read than any
+    sound file needs: pyulog searches byte by byte, up to 64 kB for each. ``gave_up`` says that it came to that.
+    """
 
     def __init__(self, file: BinaryIO, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
+        self._end = _end_of_data(file, size)
         self._read_bytes = self._told = 0
-        self.furthest = 0
+        self.gave_up = False
 
     def read(self, size: int | None = -1, /) -> bytes:
-        data = self._file.read(-1 if size is None else size)
+        if self._read_bytes > _FREE_EFFORT + _MOST_EFFORT * self._size:
+            self.gave_up = True
+            return b""
+        left = max(0, self._end - self._file.tell())
+        data = self._file.read(left if size is None or size < 0 else min(size, left))
         self._read_bytes += len(data) + 3
-        self.furthest = max(self.furthest, self._file.tell()) if data else self.furthest
         if self._progress is not None and self._read_bytes - self._told > _TELL_EVERY:
             self._told = self._read_bytes
-            self._progress(min(self.furthest, self._size), self._size)
-        if self._read_bytes > _FREE_EFFORT + _MOST_EFFORT * self._size:
-            raise _Futile("too damaged: the way through it could not be found again")
+            self._progress(self._file.tell(), self._size)
         return data
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
@@ -58,6 +61,21 @@ class _Watched(io.BufferedIOBase):
 
     def tell(self) -> int:
         return self._file.tell()
+
+
+def _end_of_data(file: BinaryIO, size: int) -> int:
+    """Where nothing but zeros follows, and a last message that ends in zeros is over."""
+    end = size
+    while end > 0:
+        start = max(0, end - _LONGEST)
+        file.seek(start)
+        kept = file.read(end - start).rstrip(b"\0")
+        if kept:
+            end = start + len(kept)
+            break
+        end = start
+    file.seek(0)
+    return min(size, end + _LONGEST)
 
 
 class _Guarded(ULog):  # type: ignore[misc]
@@ -183,8 +201,7 @@ class UlogFile:
             except _BROKEN as error:
                 cause = str(error) or type(error).__name__
                 raise LogError(f"{self.path}: damaged ULog: {cause}; check that the copy is whole") from error
-            if watched.furthest < size:
-                self.counts["bytes at the end not read"] += size - watched.furthest
+            self.counts["gave up searching through damage"] = int(watched.gave_up)
             if progress is not None:
                 progress(size, size)
             return log
