@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
+from magmav.core.smoothing import smooth
 from magmav.core.types import Heading, Record, Shaping, State
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
@@ -44,6 +46,9 @@ class CompassLog:
     stored_true_rad: array[float] = field(default_factory=_doubles)
     declination_rad: array[float] = field(default_factory=_doubles)
     sigma_rad: array[float] = field(default_factory=_doubles)
+    noise_rad: array[float] = field(default_factory=_doubles)
+    published_s: array[float] = field(default_factory=_doubles)
+    published_rad: array[float] = field(default_factory=_doubles)  # magnetic, as smoothed for the wire
     down_mg: float | None = None  # of a two-axis compass: the Earth's downward field that stood in for its third
 
     def __len__(self) -> int:
@@ -71,6 +76,9 @@ class CompassLog:
         self.stored_true_rad.append(stored_true)
         self.declination_rad.append(stored_true - stored_magnetic)
         self.sigma_rad.append(record.heading.sigma_rad if record.heading.valid else math.nan)
+        self.noise_rad.append(noise_of_heading(record.estimate, record.estimate.horizontal_mg))
+        self.published_s.append(record.published_boot_ns / 1e9)
+        self.published_rad.append(_angles(record.published)[0] if started else math.nan)
 
 
 def _angles(heading: Heading) -> tuple[float, float]:
@@ -79,7 +87,11 @@ def _angles(heading: Heading) -> tuple[float, float]:
 
 
 def describe(
-    log: CompassLog, vehicle: Vehicle | Boot, reference: Reference | None, learn_for_s: float | None
+    log: CompassLog,
+    vehicle: Vehicle | Boot,
+    reference: Reference | None,
+    learn_for_s: float | None,
+    smoothing: str = "off",
 ) -> Result:
     """One compass's entry in the result. Numbers that are not known are None. ValueError for an empty log."""
     last = log.last
@@ -105,6 +117,7 @@ def describe(
         "reasons": [{"code": r.name, "text": r.text} for r in last.verdict.reasons],
         "heading": full,
         "heading_offsets_only": offsets_only,
+        "heading_smoothed": smoothed_scores(log, reference) if smoothing != "off" else None,
         "delay_s": round(last.estimate.delay_s, 4) if known else None,
         "field_residual_mg": round(last.estimate.residual_mg, 3) if known else None,
         "samples": len(log),
@@ -152,6 +165,25 @@ def scores(
         stream = log.stored_magnetic_rad if magnetic else log.stored_true_rad
         got |= score_headings(np.array(log.boot_s), {"full": live, "stored": stream}, reference)
     return _entry(got["full"], got, log), _entry(got["offsets"], got, log)
+
+
+def smoothed_scores(log: CompassLog, reference: Reference | None) -> Result | None:
+    """The heading of every sample as measured, as smoothed for the wire, and smoothed after the flight (RTS).
+
+    Magnetic headings with the declination of their sample; None where there is nothing to compare with.
+    """
+    if reference is None:
+        return None
+    boot_s, measured, noise = (np.array(c) for c in (log.boot_s, log.magnetic_rad, log.noise_rad))
+    declination = np.nan_to_num(np.array(log.declination_rad))
+    known = np.isfinite(measured)
+    after = np.full(len(boot_s), math.nan)
+    after[known] = [s.heading_rad for s in smooth(boot_s[known], measured[known], noise[known])]
+    late = score_headings(np.array(log.published_s), {"live": np.array(log.published_rad) + declination}, reference)
+    got = score_headings(boot_s, {"measured": measured + declination, "rts": after + declination}, reference) | late
+    return {
+        name: {"rms_deg": s.rms_deg, "p95_deg": s.p95_deg, "bias_deg": s.bias_deg, "n": s.n} for name, s in got.items()
+    }
 
 
 def _after(vehicle: Vehicle | Boot, learn_for_s: float) -> Window:

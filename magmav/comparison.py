@@ -314,6 +314,7 @@ def _row(
     row: Result = {"name": o.name, "state": o.state, "reasons": list(o.reasons), "refusal": o.refusal}
     row |= {"us_per_sample": round(o.us_per_sample, 2), "samples": 0 if e is None else e.samples}
     row |= dict.fromkeys(("offsets_mg", "sigma_mg", "soft_iron", "residual_mg", "length_rms_mg"))
+    row["half_offsets_mg"] = None if o.half is None else (-o.half.hard_iron_b_mg).round(2).tolist()
     row |= _both(second, whole)
     if e is None:
         return row

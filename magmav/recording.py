@@ -170,7 +170,7 @@ def replay(
             references[system] = reference
         boot = earlier.get(system, vehicle)
         compasses = [
-            describe(log, boot, reference, learn_for_s)
+            describe(log, boot, reference, learn_for_s, settings.heading.smooth)
             for (s, _), log in sorted(keeper.compasses.items())
             if s == system
         ]

@@ -14,7 +14,7 @@ Json = Mapping[str, Any]
 _NONE = "-"
 _STATES = {"NO_DATA": "no data", "LEARNING": "learning", "READY": "ready", "REFUSED": "refused"}
 _FOOT = """offset: to be added, mG, body axes; - where a method says nothing of an axis.  fit: its own RMS residual, mG.
-second half: fitted on the first half of the time that taught, heading error scored on the rest, deg.
+second half: fitted on the first half of the time that taught, heading RMS on the rest, deg; p95: of its size.
 in-sample: fitted and scored on everything.  us: microseconds a sample."""
 
 
@@ -41,8 +41,8 @@ def _title(vehicle: Json, compass: Json) -> Text:
 
 def _table(compass: Json) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    table.add_column("method")
-    for name in ("offset x", "y", "z", "sigma x", "y", "z", "fit", "second half RMS", "p95", "in-sample RMS", "us"):
+    table.add_column("method", no_wrap=True, min_width=13)
+    for name in ("offset x", "y", "z", "sigma x", "y", "z", "fit", "second half", "p95", "in-sample", "us"):
         table.add_column(name, justify="right")
     table.add_column("gate")
     blank = (_NONE,) * 3
