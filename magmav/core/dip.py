@@ -7,14 +7,13 @@ Fields are what the two axes read with the iron removed, body axes, mG; psi is t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magmav.core.azimuth import finite
 from magmav.core.field import ExpectedField
-from magmav.core.rotation import body_from_earth
 from magmav.core.types import Mat3
 
 _LEAST_TILT_2 = math.sin(math.radians(3.0)) ** 2
@@ -77,7 +76,7 @@ def extended_dip(
 class DipFit(NamedTuple):
     """Radius rho and downward field V, mG, with their covariance (2, 2) mG^2 in that order; dip and its sigma, rad.
 
-    residual_mg : RMS of the fit per axis.  tilt_2 : what it was read from, mean sin^2(tilt) less what rho took.
+    residual_mg : RMS of the fit per axis.  tilt_2 : mean sin^2 of the tilt V was read from, less noise and rho's share.
     """
 
     radius_mg: float
@@ -102,16 +101,20 @@ class DipFitter:
     (x, y) = [[C00, C02], [C10, C12]] (rho, V), C = body_from_earth(phi, theta, psi). Replaces the mean of eq. (5).
     Kept as the triangular root of the normal equations, which needs no start value and loses no digits.
     The information on V is the sum of sin^2 theta + cos^2 theta sin^2 phi, which is sin^2 of the tilt. Noise of the
-    attitude counts as tilt that never was and makes |V| smaller; noise of the field does not.
+    attitude counts as tilt that never was and would make |V| smaller (the dip by 1.2 degrees at 4 degrees RMS of tilt
+    with 0.7 of noise), so its share is taken off; noise of the field does no such thing.
 
-    forget : weight of the past per reading, 0 to 1; 1 keeps all.
+    tilt_sigma_rad : error of roll and of pitch, each.  forget : weight of the past per reading; 1 keeps all.
     """
 
-    def __init__(self, forget: float = 1.0) -> None:
+    def __init__(self, tilt_sigma_rad: float = 0.0, forget: float = 1.0) -> None:
         if not 0.0 < forget <= 1.0:
             raise ValueError(f"forget: want above 0 up to 1, got {forget!r}")
+        if not 0.0 <= tilt_sigma_rad < 1.0:
+            raise ValueError(f"tilt_sigma_rad: want 0 or more and under 1, got {tilt_sigma_rad!r}")
         self._forget = forget
-        self._root = np.zeros((3, 3))
+        self._tilt_noise = 2.0 * tilt_sigma_rad**2
+        self._root = [[0.0] * 3 for _ in range(3)]
         self._weight = 0.0
         self._mean = np.zeros(4)  # of the four numbers that describe an attitude, and their scatter
         self._scatter = 0.0
@@ -119,13 +122,18 @@ class DipFitter:
     def add(self, x_b_mg: float, y_b_mg: float, roll_rad: float, pitch_rad: float, magnetic_rad: float) -> None:
         """Take one reading. ValueError unless all are finite."""
         finite(x_b_mg=x_b_mg, y_b_mg=y_b_mg, roll_rad=roll_rad, pitch_rad=pitch_rad, magnetic_rad=magnetic_rad)
-        rows = body_from_earth(roll_rad, pitch_rad, magnetic_rad)[:2, [0, 2]]
+        cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
+        cy, sy = math.cos(magnetic_rad), math.sin(magnetic_rad)
+        x_row, y_row = (cp * cy, -sp), (sr * sp * cy - cr * sy, sr * cp)
         fade = math.sqrt(self._forget)
-        self._root = _root(fade * self._root, np.column_stack([rows, (x_b_mg, y_b_mg)]))
+        self._root = [[fade * value for value in row] for row in self._root]
+        _take(self._root, [*x_row, x_b_mg])
+        _take(self._root, [*y_row, y_b_mg])
         self._weight = self._forget * self._weight + 1.0
-        away = rows.ravel() - self._mean
-        self._mean += away / self._weight
-        self._scatter = self._forget * self._scatter + float(away @ (rows.ravel() - self._mean))
+        attitude = np.array(x_row + y_row)
+        away = attitude - self._mean
+        self._mean = self._mean + away / self._weight
+        self._scatter = self._forget * self._scatter + float(away @ (attitude - self._mean))
 
     def merge(self, other: DipFitter) -> None:
         """Take all that another has seen."""
@@ -133,7 +141,8 @@ class DipFitter:
             return
         weight = self._weight + other._weight
         away = other._mean - self._mean
-        self._root = _root(self._root, other._root)
+        for row in other._root:
+            _take(self._root, row)
         self._scatter += other._scatter + float(away @ away) * self._weight * other._weight / weight
         self._mean = self._mean + away * other._weight / weight
         self._weight = weight
@@ -142,16 +151,18 @@ class DipFitter:
         """The answer so far, or why there is none. Changes nothing."""
         if self._weight < _LEAST_READINGS:
             return Refused(f"fewer than {_LEAST_READINGS} readings")
-        tilt_2 = float(self._root[1, 1]) ** 2 / self._weight
+        (a, b, p), (_, c, q), (_, _, rest) = self._root
+        information = c * c - self._tilt_noise * self._weight
+        tilt_2 = information / self._weight
+        if min(self._scatter, a * a) / self._weight < _LEAST_TILT_2:
+            return Refused("always the same attitude: turn the vehicle")
         if tilt_2 < _LEAST_TILT_2:
             return Refused("too little tilt: the dip shows only when the vehicle banks or pitches 3 degrees and more")
-        if self._scatter / self._weight < _LEAST_TILT_2:
-            return Refused("always the same attitude: turn the vehicle")
-        root = self._root[:2, :2]
-        radius, down = np.linalg.solve(root, self._root[:2, 2]).tolist()
-        per_axis = float(self._root[2, 2]) ** 2 / (2.0 * self._weight - 2.0)
-        inverse = np.linalg.inv(root)
-        covariance = per_axis * (inverse @ inverse.T)
+        down = c * q / information
+        radius = (p - b * down) / a
+        per_axis = (rest * rest + (q - c * down) ** 2) / (2.0 * self._weight - 2.0)
+        lean = np.array([-b / a, 1.0])  # how the radius follows V
+        covariance = per_axis * (np.diag([1.0 / a**2, 0.0]) + np.outer(lean, lean) * (c / information) ** 2)
         if radius <= 3.0 * math.sqrt(covariance[0, 0]):
             return Refused("no horizontal field along the headings given: no field, or headings that are wrong")
         if math.sqrt(per_axis) > _LARGEST_SCATTER * radius:
@@ -169,6 +180,12 @@ class DipFitter:
         )
 
 
-def _root(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The (3, 3) triangular root whose square is the sum of both squares."""
-    return np.array(np.linalg.qr(np.vstack([one, other]), mode="r"))
+def _take(root: list[list[float]], row: Sequence[float]) -> None:
+    """Turn one row of the regression into the triangular root, in place (Givens)."""
+    left = list(row)
+    for i, kept in enumerate(root):
+        length = math.hypot(kept[i], left[i])
+        if length > 0.0:
+            c, s = kept[i] / length, left[i] / length
+            for j in range(i, len(left)):
+                kept[j], left[j] = c * kept[j] + s * left[j], c * left[j] - s * kept[j]
