@@ -294,6 +294,7 @@ def test_px4s_formula_on_the_raw_field_gives_the_corrected_one(flown: Flown) -> 
         wanted = topic(flown.ulg, "vehicle_magnetometer", *(f"magnetometer_ga[{k}]" for k in range(3)), instance=i)
         got = px4_formula(held, i, raw, ampere / 1000 if held["CAL_MAG_COMP_TYP"] == 2 else ampere)
         np.testing.assert_allclose(got, wanted, atol=2e-6)
+    assert held["CAL_MAG0_PRIO"] > held["CAL_MAG1_PRIO"] > held["CAL_MAG2_PRIO"]  # the order of the compasses
     assert (held["CAL_MAG0_ROT"], held["CAL_MAG1_ROT"], held["CAL_MAG2_ROT"]) == (0, -1, 2)
     motor = table(flown.bin, "MAG", "I", "MOX")
     want = np.trunc(-2.0 * topic(flown.ulg, "battery_status", "current_a")[:, 0])

@@ -15,7 +15,7 @@ from magmav_sim.parameters import Parameters, compass_name
 _GAUSS_PER_MG = 1e-3
 _AMPERE_PER_KILOAMPERE = 1e3
 _LEAST_SCALE, _MOST_SCALE = 1 / 1.5, 1.5
-_EXTERNAL_PRIORITY, _INTERNAL_PRIORITY = 75, 50
+_PRIORITY = (75, 50, 25)  # ArduPilot's order of compasses, as the highest goes first with PX4
 
 
 def px4_parameters(parameters: Parameters, compasses: int) -> dict[str, int | float]:
@@ -44,7 +44,7 @@ def px4_parameters(parameters: Parameters, compasses: int) -> dict[str, int | fl
         rotation = 0 if held.rotation is None else int(parameters[compass_name("ORIENT", number)])
         out[name + "ID"] = int(parameters[compass_name("DEV_ID", number)])
         out[name + "ROT"] = rotation if external else -1
-        out[name + "PRIO"] = _EXTERNAL_PRIORITY if external else _INTERNAL_PRIORITY
+        out[name + "PRIO"] = _PRIORITY[number - 1]
         for i, axis in enumerate("XYZ"):
             out[f"{name}{axis}OFF"] = float(offset[i])
             out[f"{name}{axis}SCALE"] = float(shape[i, i])
