@@ -18,12 +18,15 @@ from magmav.core.estimators import ESTIMATORS
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
+from magmav.core.published import Publisher, noise_of_heading
+from magmav.core.rotation import wrap_tau
 from magmav.core.types import (
     ZERO3,
     AttitudeReading,
     AxisState,
     CurrentReading,
     FieldModel,
+    Heading,
     InertialReading,
     LandedReading,
     MagReading,
@@ -49,6 +52,7 @@ from magmav.settings import Settings
 
 _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
 _SAY_FROZEN_NS = 1_000_000_000
+_DOUBTED_S = 5.0  # after a sudden change the answer is still on its way: the gyro holds the own yaw
 _ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 
 
@@ -79,7 +83,7 @@ class Vehicle:
         self.autopilot = 0
         self.learning = settings.learn.on
         self.learn_for_s: float | None = None
-        self.assembler = Assembler(system)
+        self.assembler = Assembler(system, settings.attitude.own)
         self.phase = Phase()
         self._books = _books()
         self.former: Boot | None = None
@@ -91,6 +95,7 @@ class Vehicle:
         self._epochs: dict[int, int] = {}
         self._settle_until_ns: dict[int, int] = {}
         self._latest: dict[int, Record] = {}
+        self._publishers: dict[int, Publisher] = {}
         self._first_ns: int | None = None
         self._reboots = 0
         if not math.isnan(settings.place.lat_deg):
@@ -156,7 +161,11 @@ class Vehicle:
         undo: Callable[[Vec3], Vec3] = partial(held.undo, compass, source=r.source)
         shaping = held.shaping(compass)
         if axes == 2:
-            undo, shaping = without_third(undo, shaping)
+            try:
+                undo, shaping = without_third(undo, shaping)
+            except ValueError:
+                self.counts[f"compass {compass}: two axes: sensor is mounted upright"] += 1
+                return None
         sample = self.assembler.mag(r, undo, shaping, learn, axes)
         self._after_reboot()
         if sample is None:
@@ -165,7 +174,8 @@ class Vehicle:
         if self._tap is not None:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
-        finding = channel.step(sample, used_b_mg, circumstances)
+        finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
+        published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
             t_ns=t_ns,
             system=self.system,
@@ -187,8 +197,36 @@ class Vehicle:
             learnt=sample.learn,
             relative=not held.known(compass),
             axes=axes,
+            published=published,
+            published_boot_ns=published_ns,
         )
         return record
+
+    def _publish(self, sample: Sample, finding: Finding) -> tuple[Heading, int]:
+        """The heading that goes out, smoothed as the settings say, and the boot time it belongs to."""
+        wanted, compass = self.settings.heading, sample.compass
+        publisher = self._publishers.get(compass)
+        if publisher is None or (publisher.smoothing, publisher.lag) != (wanted.smooth, wanted.lag):
+            publisher = self._publishers[compass] = Publisher(wanted.smooth, wanted.lag)
+        noise = noise_of_heading(finding.estimate, finding.estimate.horizontal_mg)
+        return publisher.step(sample.boot_ns, finding.heading, noise)
+
+    def _steadied(self, s: Sample, f: Finding) -> Finding:
+        """Where no attitude comes: compass 1 moves the own yaw while it is believed, and that yaw is its heading.
+
+        Own tilt and turning never hear of the compass, so nothing learnt with them confirms itself.
+        """
+        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not f.heading.valid:
+            return f
+        motion = self.assembler.motion
+        if f.verdict.state is not State.REFUSED and f.estimate.changed_ago_s >= _DOUBTED_S:
+            motion.field(f.corrected_b_mg, s.age_s + f.estimate.delay_s, f.heading.sigma_rad)
+        yaw = motion.magnetic_yaw(s.boot_ns)
+        if yaw is None:
+            return f
+        was = f.heading
+        true = wrap_tau(was.true_rad + yaw - was.magnetic_rad) if was.true_valid else 0.0
+        return replace(f, heading=replace(was, magnetic_rad=yaw, true_rad=true))
 
     def _to_store(self, compass: int, finding: Finding) -> Vec3:
         """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4)."""
@@ -208,6 +246,7 @@ class Vehicle:
             channel.verdict = Verdict(State.REFUSED, last.verdict.axes, reasons)
             self.counts["mag: frozen"] += 1
         said = replace(last, t_ns=t_ns, boot_ns=r.boot_ns, heading=UNKNOWN, verdict=channel.verdict, learnt=False)
+        said = replace(said, published=UNKNOWN, published_boot_ns=r.boot_ns)
         self._latest[r.compass] = said
         return said
 
@@ -279,6 +318,7 @@ class Vehicle:
         self._epochs.clear()
         self._settle_until_ns.clear()
         self._latest.clear()
+        self._publishers.clear()
         self._first_ns = self._unix_minus_boot_ns = None
         for channel in self.channels.values():
             if not channel.keeps:

@@ -107,3 +107,10 @@ def test_the_inverse_of_two_axes_is_exact(seed):
     assert back[2] == 0.0
     again = shaping.matrix @ (back + [*offset[:2], 0.0]) + shaping.motor_b_mg
     assert again[:2] == pytest.approx(sent[:2], abs=1e-8)
+
+
+def test_a_sensor_mounted_upright_is_refused():
+    """Pitched by 90 degrees its x looks down: two axes of it hold one of the level plane."""
+    upright = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="two axes"):
+        without_third(lambda m: vec3(upright @ m, "field"), Shaping(mat3(np.eye(3), "m"), vec3((0, 0, 0), "e")))

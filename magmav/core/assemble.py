@@ -26,6 +26,8 @@ _REFRESH_S = 0.1  # ArduPilot's refresh; a slower stream only shows it more rare
 _AVERAGED_S = 0.07
 # PX4's logs stamp a value with the time it was measured, so it has no age.
 _STAMPED = frozenset({"sensor_mag", "vehicle_magnetometer", "vehicle_magnetometer less bias", "sensor_combined"})
+# ArduPilot writes its log right after the compass was read: a value has not waited.
+_AT_ONCE = frozenset({"MAG", "MAG2", "MAG3"})
 _PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")
 
 
@@ -93,6 +95,8 @@ class _Compass:
         """
         if self.refresh_s < _AVERAGED_S or self.source in _STAMPED:
             return 0.0
+        if self.source in _AT_ONCE:
+            return 0.5 * _REFRESH_S
         return 0.5 * (_REFRESH_S + min(self.period_s, _REFRESH_S))
 
 

@@ -15,6 +15,7 @@ from magmav.core.rotation import euler_rates, wrap_tau
 from magmav.core.two_axis import Doubts, down_from_dip, heading_of_two_axes, vertical_component
 from magmav.core.types import Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
 
+_LEAST_LEVEL = 0.05  # of what two axes see of the level plane; 1 when both lie in it
 _WEAKEST_MG = 20.0  # a circle smaller than this is none
 
 
@@ -102,18 +103,21 @@ def without_third(undo: Callable[[Vec3], Vec3], shaping: Shaping) -> tuple[Calla
     """The autopilot's correction and its inverse for two axes: no third component takes part, in or out.
 
     undo(m) = L (m - motor) - offset in three axes. What a stored matrix mixes in from the third axis is not known here
-    and taken as nothing.
+    and taken as nothing. ValueError where that leaves nothing, as with a sensor mounted upright.
     """
     motor = shaping.motor_b_mg
     offset = -undo(motor)
     columns = [undo(vec3(motor + unit, "field")) + offset for unit in np.eye(3)]
-    inverse = np.linalg.inv(_two(np.linalg.inv(np.column_stack(columns))))
-    level = np.array([1.0, 1.0, 0.0])
+    level = _two(np.linalg.inv(np.column_stack(columns)))
+    if abs(np.linalg.det(level)) < _LEAST_LEVEL:
+        raise ValueError("two axes: neither of the sensor's first two axes lies level")
+    inverse = np.linalg.inv(level)
+    kept = np.array([1.0, 1.0, 0.0])
 
     def two(sent_b_mg: Vec3) -> Vec3:
-        return vec3(level * (inverse @ (sent_b_mg - motor) - offset), "field")
+        return vec3(kept * (inverse @ (sent_b_mg - motor) - offset), "field")
 
-    return two, Shaping(mat3(_two(shaping.matrix), "matrix"), vec3(level * motor, "motor term"))
+    return two, Shaping(mat3(_two(shaping.matrix), "matrix"), vec3(kept * motor, "motor term"))
 
 
 def _two(matrix: Mat3) -> Mat3:
