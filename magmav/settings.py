@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct, field
 
+from magmav.core.estimators import ESTIMATORS
+
 
 class SettingsError(ValueError):
     """A settings file or value that cannot be used; the text names file, key and limits."""
@@ -49,7 +51,7 @@ class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is learnt from, and how."""
 
     on: Annotated[bool, _knob("learn at all; off: what is known is kept and published", param="MMAG_LEARN")] = True
-    estimator: Annotated[str, _knob("kalman, sphere or circle", ge=None)] = "kalman"
+    estimator: Annotated[str, _knob("one of " + ", ".join(ESTIMATORS), ge=None)] = "kalman"
     on_ground: Annotated[bool, _knob("learn from a flying vehicle on the ground as well")] = False
     settle_s: Annotated[float, _knob("not learnt from after a change of compass parameters", "s", ge=0.2, le=10.0)] = (
         1.0
@@ -167,8 +169,8 @@ def checked(settings: Settings, where: str) -> Settings:
         raise SettingsError(f"{where}: place: give lat_deg and lon_deg together")
     if abs(place.lat_deg) > 90.0 or abs(place.lon_deg) > 180.0:
         raise SettingsError(f"{where}: place: {place.lat_deg}, {place.lon_deg} is not on Earth")
-    if settings.learn.estimator not in ("kalman", "sphere", "circle"):
-        raise SettingsError(f"{where}: learn.estimator: {settings.learn.estimator!r}; choose kalman, sphere or circle")
+    if settings.learn.estimator not in ESTIMATORS:
+        raise SettingsError(f"{where}: learn.estimator: {settings.learn.estimator!r}; choose {', '.join(ESTIMATORS)}")
     return settings
 
 

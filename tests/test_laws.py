@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from synthetic_flight import EARTH_MG, HARD_IRON_MG
 from test_pipeline import bits
 
+from magmav.core.estimators import ESTIMATORS
 from magmav.core.types import AxisState, State
 from magmav.settings import Settings, with_value
 
@@ -170,7 +171,7 @@ def test_learning_off_keeps_the_answer_through_a_foreign_change_and_a_reboot():
     assert again.offsets_mg == pytest.approx(later.offsets_mg) and again.verdict.state is State.READY
 
 
-@pytest.mark.parametrize("estimator", ["kalman", "sphere", "circle"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_estimator_survives_a_stuck_a_saturated_and_a_zero_compass(estimator):
     tell = Teller(1)
     for value in ((300, 20, 600), (32767, -32768, 32767), (0, 0, 0), (1, 0, 0)):

@@ -43,8 +43,8 @@ def test_no_file_is_the_defaults(tmp_path):
 
 
 def test_a_few_keys_change_only_themselves(tmp_path):
-    got = load(written(tmp_path, "[gate]\nsamples = 200\n[learn]\nestimator = 'sphere'\n"))
-    assert (got.gate.samples, got.learn.estimator) == (200, "sphere")
+    got = load(written(tmp_path, "[gate]\nsamples = 200\n[learn]\nestimator = 'taubin'\n"))
+    assert (got.gate.samples, got.learn.estimator) == (200, "taubin")
     assert got.gate.residual_mg == Settings().gate.residual_mg
     assert got.wire == Settings().wire
 

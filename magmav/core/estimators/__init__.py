@@ -1,16 +1,24 @@
-"""Streaming estimators of hard iron: one method per file, one contract.
+"""Streaming estimators of hard (and soft) iron: one method per file, one contract.
 
 An estimator takes Samples one at a time in O(1) and says on request what it believes. It must not know where Samples
 come from. It can be copied at any moment (copy.deepcopy, pickle) and the copy goes on to the same bits.
 
-circle   Sawicki's method III, on levelled data, in its O(1) centred form: the two level axes only
-sphere   the same regression in three dimensions
-kalman   a linear Kalman filter: levelled field constant but for the turning the gyro reports (the default)
+kalman           a linear Kalman filter: levelled field constant but for the turning the gyro reports (the default)
+minmax           Sawicki 2017, method I: middle of the extremes
+kasa, bullock    methods II and III: the same least-squares circle or sphere, by two sets of equations
+taubin           the same without the pull of short arcs to small circles
+ellipse          Sytnyk et al. 2014, soft iron in the well-posed form, in the level plane
+ellipsoid        the same in three dimensions, body axes
+sytnyk           the printed chain: extremes, turn, extremes again
+
+The four circles are fitted in body axes; with ``_level`` they are fitted to levelled data, as the papers do
+(orders.py says what that costs).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from magmav.core.field import ExpectedField
@@ -18,7 +26,7 @@ from magmav.core.types import Estimate, Sample
 
 
 class Estimator(Protocol):
-    """What every method offers."""
+    """What every method offers. Those made by ``fitted`` also have why_not() -> str | None and has_sigma."""
 
     def step(self, sample: Sample) -> None:
         """Learn from one sample (or only carry time forward, where sample.learn is False)."""
@@ -29,16 +37,41 @@ class Estimator(Protocol):
         ...
 
 
-def _circle() -> Estimator:
-    from magmav.core.estimators.circle import CircleEstimator
-
-    return CircleEstimator()
+LEAST_SAMPLES = 20
 
 
-def _sphere() -> Estimator:
-    from magmav.core.estimators.sphere import SphereEstimator
+def fitted(method: str, order: str = "body", forget: float = 1.0) -> Estimator:
+    """A figure fitted to the points of samples.
 
-    return SphereEstimator()
+    method : minmax, kasa, bullock, taubin, ellipse (level), ellipsoid (body) or sytnyk (level).
+    order  : "body" subtracts in body axes and then levels; "level" fits levelled data.
+    forget : weight of a sample against that of the next, above 0 to 1; minmax and sytnyk cannot forget.
+    ValueError naming a method, order or forgetting that does not exist.
+    """
+    from magmav.core.estimators.fit import Fitter
+    from magmav.core.estimators.minmax import MinMaxFitter
+    from magmav.core.estimators.moments import Moments
+    from magmav.core.estimators.orders import BodyOrder, FitEstimator, LevelOrder
+    from magmav.core.estimators.streaming import METHODS, MomentsFitter
+    from magmav.core.estimators.sytnyk import SytnykFitter
+
+    if method not in (*METHODS, "minmax", "sytnyk"):
+        raise ValueError(f"method: no {method!r}; choose {', '.join((*METHODS, 'minmax', 'sytnyk'))}")
+    if order not in ("body", "level"):
+        raise ValueError(f"order: want body or level, got {order!r}")
+    if method in ("minmax", "sytnyk") and forget != 1.0:
+        raise ValueError(f"forget: {method} keeps extremes and cannot forget, got {forget}")
+    if {"ellipse": "level", "sytnyk": "level", "ellipsoid": "body"}.get(method, order) != order:
+        raise ValueError(f"order: {method} does not work in order {order!r}")
+    moments = Moments(3, 500.0, forget) if order == "body" else Moments(2, 200.0, forget)
+    fitter: Fitter
+    if method == "minmax":
+        fitter = MinMaxFitter(moments, LEAST_SAMPLES)
+    elif method == "sytnyk":
+        fitter = SytnykFitter(moments, LEAST_SAMPLES)
+    else:
+        fitter = MomentsFitter(moments, METHODS[method], LEAST_SAMPLES, watch=True)
+    return FitEstimator(BodyOrder() if order == "body" else LevelOrder(), fitter, method not in ("minmax", "sytnyk"))
 
 
 def _kalman() -> Estimator:
@@ -47,4 +80,17 @@ def _kalman() -> Estimator:
     return KalmanEstimator()
 
 
-ESTIMATORS: dict[str, Callable[[], Estimator]] = {"circle": _circle, "sphere": _sphere, "kalman": _kalman}
+ESTIMATORS: dict[str, Callable[[], Estimator]] = {
+    "kalman": _kalman,
+    "minmax": partial(fitted, "minmax"),
+    "kasa": partial(fitted, "kasa"),
+    "bullock": partial(fitted, "bullock"),
+    "taubin": partial(fitted, "taubin"),
+    "minmax_level": partial(fitted, "minmax", "level"),
+    "kasa_level": partial(fitted, "kasa", "level"),
+    "bullock_level": partial(fitted, "bullock", "level"),
+    "taubin_level": partial(fitted, "taubin", "level"),
+    "ellipse": partial(fitted, "ellipse", "level"),
+    "ellipsoid": partial(fitted, "ellipsoid"),
+    "sytnyk": partial(fitted, "sytnyk", "level"),
+}
