@@ -177,8 +177,8 @@ def test_a_path_that_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         DataflashRecording(tmp_path)
 
 
-def hurt_copies(whole: bytes, many: int, seed: int) -> list[bytes]:
-    """Copies with one to fifty flipped bits, and one in ten cut short instead."""
+def hurt_copies(whole: bytes, head: int, many: int, seed: int) -> list[bytes]:
+    """Copies with one to fifty flipped bits: anywhere, or among the definitions alone; and one in ten cut short."""
     rng = random.Random(seed)
     out = []
     for i in range(many):
@@ -187,18 +187,19 @@ def hurt_copies(whole: bytes, many: int, seed: int) -> list[bytes]:
             continue
         copy = bytearray(whole)
         for _ in range(rng.choice((1, 5, 50))):
-            copy[rng.randrange(len(copy))] ^= 1 << rng.randrange(8)
+            copy[rng.randrange(head if i % 2 else len(copy))] ^= 1 << rng.randrange(8)
         out.append(bytes(copy))
     return out
 
 
 def test_damage_gives_readings_or_a_log_error_and_time_never_turns_back(tmp_path: Path) -> None:
     path = tmp_path / "hurt.bin"
-    whole = flight(2.0).binary()
+    log = flight(1.0)
+    whole, head = log.binary(), sum(map(len, log.pieces()[: len(log.head())]))
     path.write_bytes(whole)
     all_of_it = sum(1 for _ in DataflashRecording(path).readings())
     kept = []
-    for copy in hurt_copies(whole, DAMAGES, seed=171):
+    for copy in hurt_copies(whole, head, DAMAGES, seed=171):
         path.write_bytes(copy)
         try:
             times = [t for t, _ in DataflashRecording(path).readings()]

@@ -170,6 +170,18 @@ def test_what_is_no_measurement_gives_no_reading_and_is_counted(tmp_path: Path) 
     assert {p.value for p in told.of(ParamReading) if p.name == "COMPASS_OFS_X"} == {10.0}
 
 
+def test_a_signalling_nan_is_no_number_and_no_noise(tmp_path: Path) -> None:
+    log = flight(1.0)
+    raw = bytearray(log.binary())
+    place = raw.rindex(IMU.body((5_981_000, 0, 0.0, 0.0, 0.4, 0.0, 0.0, -9.80665)))
+    raw[place + 12 : place + 16] = struct.pack("<I", 0x7F800001)
+    path = tmp_path / "nan.bin"
+    path.write_bytes(raw)
+    recording = DataflashRecording(path)
+    assert recording.counts == {"IMU: not a number": 2}
+    assert sum(isinstance(r, InertialReading) for _, r in recording.readings()) == 49
+
+
 def test_an_angle_beyond_half_a_turn_is_the_same_angle_within(tmp_path: Path) -> None:
     log = flight(1.0)
     log.add(ATT, 5_950_000, 0.0, -181.05, 0.0, -2.23, 0.0, 270.0)
@@ -288,6 +300,19 @@ def test_a_reboot_inside_the_file_starts_anew_with_its_own_parameters(tmp_path: 
     assert vehicle.assembler.reboots == 1
     assert vehicle.phase.armed and held[-1] == -55.0
     assert 10.0 in held
+
+
+def test_one_compass_in_two_messages_is_one_compass(tmp_path: Path) -> None:
+    log = flight(2.0)
+    twin = moved(OLD_MAG, number=91, name="MAG2")
+    for k in range(20):
+        log.add(twin, 5001 + 100 * k, 1, 2, 3, *(0,) * 6, 1)
+    log.rows.sort(key=lambda row: row[1][0] * (1000 if row[0] is twin else 1))
+    told = Told(log, tmp_path)
+    assert {m.source for m in told.of(MagReading) if m.compass == 2} == {"MAG", "MAG2"}
+    pipeline = Pipeline(Settings(), world_magnetic_model)
+    records = [r for t, reading in told.all if (r := pipeline.step(reading, t)) is not None and r.compass == 2]
+    assert len({r.stored_b_mg[2] for r in records}) == 1
 
 
 def test_a_few_wild_times_are_damage_and_no_reboot(tmp_path: Path) -> None:

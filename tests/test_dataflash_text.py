@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from dataflash_writer import EV, MSG, Log, flight
 
 from magmav.core.types import Reading
+from magmav.logs import LogError
 from magmav.logs.dataflash_readings import DataflashRecording
 from magmav.logs.dataflash_text import read_text
 
@@ -72,3 +74,23 @@ def test_a_message_defined_anew_is_read_by_each_definition_in_its_place() -> Non
     first, second = read_text(text.encode(), "x.log").of("XYZ")
     assert first.values("A").tolist() == [10, 20] and second.values("A").tolist() == [30]
     assert second.values("B").tolist() == [0.5]
+
+
+def test_damage_gives_readings_or_a_log_error(tmp_path: Path) -> None:
+    path, rng = tmp_path / "hurt.log", random.Random(7)
+    log = flight(0.5)
+    whole = log.text().encode()
+    head = len("".join(log.text().splitlines(keepends=True)[: len(log.head())]))
+    good = 0
+    for i in range(100):
+        copy = bytearray(whole)
+        for _ in range(rng.choice((1, 5, 50))):
+            copy[rng.randrange(head if i % 2 else len(copy))] = rng.randrange(256)
+        path.write_bytes(copy[: rng.randrange(len(copy))] if i % 10 == 0 else copy)
+        try:
+            times = [t for t, _ in told(path)]
+        except LogError:
+            continue
+        assert times == sorted(times)
+        good += len(times) > 50
+    assert good > 50

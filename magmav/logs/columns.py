@@ -107,7 +107,12 @@ class Table:
     instance_label: str | None = None
 
     def __contains__(self, label: str) -> bool:
-        return label in self.letters
+        """Whether this is a column of numbers: damage to a definition may make it anything."""
+        return self.letters.get(label, "a") not in STRINGS + "a"
+
+    def has_text(self, label: str) -> bool:
+        """Whether this is a column of strings."""
+        return self.letters.get(label, "a") in STRINGS
 
     def __len__(self) -> int:
         return len(self.at)
@@ -130,12 +135,13 @@ class Table:
         """
         plain = LETTERS[self.letters[label]].divisor == 1.0
         mult = self.mults.get(label, otherwise) if plain else 1.0
-        out: Floats = np.asarray(self.values(label), dtype=np.float64) * (mult * per)
+        with np.errstate(all="ignore"):  # damage may spell a signalling NaN; callers ask what is finite
+            out: Floats = np.asarray(self.values(label), dtype=np.float64) * (mult * per)
         return out
 
     def instance(self) -> Ints:
         """(n,) number of the sensor or filter core, from 0; zeros where the message tells none apart."""
-        label = self.instance_label or next((c for c in _INSTANCE if c in self), None)
+        label = next((c for c in (self.instance_label, *_INSTANCE) if c is not None and c in self), None)
         if label is None:
             return np.zeros(len(self), dtype=np.int64)
         return whole(self.values(label))

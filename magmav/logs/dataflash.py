@@ -15,7 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.logs import LogError
-from magmav.logs.columns import HEADER, Definition, Ints, Table, Tables, clean, define, instance_label, multipliers
+from magmav.logs.columns import (
+    HEADER,
+    Definition,
+    Ints,
+    Table,
+    Tables,
+    clean,
+    define,
+    instance_label,
+    multipliers,
+    whole,
+)
 
 Bytes = NDArray[np.uint8]
 
@@ -66,12 +77,12 @@ def with_units(tables: list[tuple[Definition, Table]]) -> dict[str, list[Table]]
     power_of: dict[str, float] = {}
     said: dict[int, tuple[str, str]] = {}
     for definition, table in tables:
-        if definition.name == "MULT" and {"Id", "Mult"} <= table.letters.keys():
-            ids = table.texts("Id") if table.letters["Id"] in "nNZ" else [chr(int(i) & 255) for i in table.values("Id")]
-            power_of |= zip(ids, np.asarray(table.values("Mult"), dtype=np.float64).tolist(), strict=True)
-        elif definition.name == "FMTU" and {"FmtType", "UnitIds", "MultIds"} <= table.letters.keys():
+        if definition.name == "MULT" and "Mult" in table and ("Id" in table or table.has_text("Id")):
+            ids = table.texts("Id") if table.has_text("Id") else [chr(i & 0xFF) for i in whole(table.values("Id"))]
+            power_of |= zip(ids, table.base("Mult").tolist(), strict=True)
+        elif definition.name == "FMTU" and "FmtType" in table and all(map(table.has_text, ("UnitIds", "MultIds"))):
             pairs = zip(table.texts("UnitIds"), table.texts("MultIds"), strict=True)
-            said |= zip(np.asarray(table.values("FmtType")).astype(int).tolist(), pairs, strict=True)
+            said |= zip(whole(table.values("FmtType")).tolist(), pairs, strict=True)
     out: dict[str, list[Table]] = {}
     for definition, table in tables:
         if definition.number in said:
@@ -118,10 +129,10 @@ def _definitions(data: Bytes, at: Ints, counts: Counter[str]) -> list[tuple[int,
     assert layout is not None
     at = at[at + _FMT_SIZE <= len(data)]
     for place, raw in zip(at.tolist(), _rows(data, at, _FMT_SIZE).view(layout)[:, 0] if len(at) else (), strict=True):
-        name, letters = clean(raw["Name"]), clean(raw["Format"])
-        definition = define(int(raw["Type"]), int(raw["Length"]), name, letters, clean(raw["Columns"]))
-        if not _NAME.match(name) or definition.size < HEADER or definition.number == _FMT:
+        name, number = clean(raw["Name"]), int(raw["Type"])
+        if number == _FMT or not _NAME.match(name) or raw["Length"] < HEADER:
             continue  # FMT itself, or its three bytes by chance inside another record
+        definition = define(number, int(raw["Length"]), name, clean(raw["Format"]), clean(raw["Columns"]))
         if newest.get(definition.number) == definition:
             continue
         if definition.layout is None and definition.number in newest:

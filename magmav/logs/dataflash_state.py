@@ -49,7 +49,7 @@ def parameters(log: Log) -> list[tuple[Moments, list[str], list[float]]]:
     """(when, names, values) of every PARM record, damage dropped and counted."""
     out = []
     for table in log.tables.of("PARM"):
-        if "Name" not in table or "Value" not in table:
+        if not table.has_text("Name") or "Value" not in table:
             continue
         when, good = log.clock.moments(table)
         names, values = table.texts("Name"), table.base("Value")
@@ -94,8 +94,8 @@ def system_of(held: Mapping[str, float]) -> int:
 
 def kind_of(log: Log, held: Mapping[str, float]) -> int:
     """MAV_TYPE, from the firmware's name in MSG or VER and from the frame parameters; 0 (generic) where unknown."""
-    said = [text for name, label in (("MSG", "Message"), ("VER", "FWS")) for t in log.tables.of(name) if label in t
-            for text in t.texts(label)]  # fmt: skip
+    sources = [(t, label) for name, label in (("MSG", "Message"), ("VER", "FWS")) for t in log.tables.of(name)]
+    said = [text for table, label in sources if table.has_text(label) for text in table.texts(label)]
     base = next((kind for text in said for pattern, kind in _FIRMWARE if pattern.search(text)), _GENERIC)
     frame = int(held.get("FRAME_CLASS", 0.0))
     if base == _PLANE:
