@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from figures import ALL_2D, ALL_3D, ball, figure, fitted, ring, rotation, sample, taught
+from figures import ALL_2D, ALL_3D, ball, figure, fitted, ring, rotation, sample, seen_from, taught
 
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.estimators.fit import Fit, Refusal
@@ -96,6 +96,15 @@ def test_a_circle_is_never_worse_than_its_bound(method):
             assert np.linalg.norm(got.centre) < 50.0
             assert got.centre @ np.linalg.solve(got.covariance + 1e-12 * np.eye(2), got.centre) < 16.0
     assert 10 < taken < 40
+
+
+@pytest.mark.parametrize("method", ["kasa", "bullock"])
+def test_banked_turns_too_noisy_for_a_sphere_are_called_that_and_not_a_standstill(method):
+    """A thin thick-skinned band: neither a sphere nor a circle, but the vehicle did turn and bank."""
+    r = np.random.default_rng(2)
+    bank = r.uniform(-0.25, 0.25, 500)
+    points = seen_from(bank, 0.0 * bank, np.linspace(0.0, 12.0, 500), (205.0, 0.0, 430.0)) + r.normal(0, 25.0, (500, 3))
+    assert fitted(method, points) is Refusal.ARC_TOO_SHORT
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 1), (5, 4), (2, 3, 3)])

@@ -111,7 +111,10 @@ def round_fit(m: Moments, method: Round, least: int, independent: float = 1.0) -
     spread, axes = np.linalg.eigh(m.covariance())
     got = _in_directions(m, method, spread, axes, independent)
     if d == 3 and got in (Refusal.ARC_TOO_SHORT, Refusal.COLLINEAR):
-        return _in_directions(m, method, spread[1:], axes[:, 1:], independent)
+        flat = _in_directions(m, method, spread[1:], axes[:, 1:], independent)
+        # Banked turns are no circle in a plane; what is missing then is still the third direction.
+        thin = got is Refusal.ARC_TOO_SHORT and flat is Refusal.NO_ROTATION
+        return got if thin else flat
     return got
 
 

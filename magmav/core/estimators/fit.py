@@ -23,7 +23,7 @@ class Refusal(Enum):
     NOT_FINITE = "a point is not a number, or beyond any compass"
     NO_ROTATION = "points scatter about no circle: not turned, or disturbed, or tilted too far to level first"
     COLLINEAR = "all points lie on one line"
-    ARC_TOO_SHORT = "too short an arc: turn the vehicle further round"
+    ARC_TOO_SHORT = "too short an arc, or too thin a band of tilts: turn the vehicle further, and bank it"
     NOT_AN_ELLIPSE = "no ellipse fits: not turned all the way round, or disturbed, or tilted too far to level first"
 
 
