@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from magmav.core.channel import Channel, Circumstances
 from magmav.core.estimators import ESTIMATORS, Estimator
+from magmav.core.estimators.orders import UNKNOWN_MG
 from magmav.core.field import ExpectedField
 from magmav.core.types import Estimate, FieldModel, Sample, Vec3
 from magmav.logs import Recording
@@ -30,8 +31,6 @@ from magmav.vehicle import Boot, Vehicle, limits
 
 Floats = NDArray[np.float64]
 Result = dict[str, Any]
-UNKNOWN_MG = 900.0
-"""A method that claims an axis no better than this says nothing about it."""
 
 
 class Heard(NamedTuple):
@@ -319,7 +318,7 @@ def _row(
     if e is None:
         return row
     sigma = np.sqrt(np.maximum(np.diag(e.covariance_mg2), 0.0))
-    says = sigma < UNKNOWN_MG if o.has_sigma else np.ones(3, dtype=bool)
+    says = sigma < (0.9 if o.has_sigma else 1.1) * UNKNOWN_MG
     corrected = (columns.sensor_b_mg[columns.learn] - e.hard_iron_b_mg) @ (e.soft_iron_b @ matrix).T
     length = np.linalg.norm(corrected, axis=1)
     row["offsets_mg"] = [round(-float(v), 2) if s else None for v, s in zip(e.hard_iron_b_mg, says, strict=True)]

@@ -88,7 +88,7 @@ def test_it_claims_no_sigma_and_so_is_never_written():
         e = ESTIMATORS[name]()
         assert e.has_sigma is False
         points = np.column_stack((ring(200, seed=1), np.full(200, 430.0)))
-        assert np.all(taught(e, points).estimate(None).own_sigma_mg == 1000.0)
+        assert np.all(taught(e, points).estimate(None).own_sigma_mg >= 1000.0)
     assert ESTIMATORS["bullock"]().has_sigma is True
 
 

@@ -77,11 +77,12 @@ def levelled(field_b_mg: Floats, cloud: Cloud) -> Floats:
 def _row(axes: list[Axes], entry: Mapping[str, Any], cloud: Cloud) -> None:
     level, after, above, beside = axes
     raw = levelled(cloud.sensor_b_mg, cloud)
-    level.plot(raw[:, 0], raw[:, 1], ".", ms=1.6, mew=0, color=FAINT, label="points")
+    size = 3.5 if len(raw) < 1500 else 1.8
+    level.plot(raw[:, 0], raw[:, 1], ".", ms=size, mew=0, color=FAINT, label="points")
     x, y, z = cloud.sensor_b_mg.T
-    above.plot(y, x, ".", ms=1.6, mew=0, color=FAINT)
-    beside.plot(x, z, ".", ms=1.6, mew=0, color=FAINT)
-    last = "no method answered"
+    above.plot(y, x, ".", ms=size, mew=0, color=FAINT)
+    beside.plot(x, z, ".", ms=size, mew=0, color=FAINT)
+    shown = ""  # the first method that knows all three axes
     for index, method in enumerate(m for m in entry["estimators"] if m["offsets_mg"] is not None):
         iron = -np.array([0.0 if v is None else v for v in method["offsets_mg"]])
         colour = _COLOURS[index % len(_COLOURS)]
@@ -95,16 +96,16 @@ def _row(axes: list[Axes], entry: Mapping[str, Any], cloud: Cloud) -> None:
         if method["offsets_mg"][2] is not None:
             _ring(above, iron[1], iron[0], total, colour, style)
             _ring(beside, iron[0], iron[2], total, colour, style)
-        after.clear()
-        clean = levelled(away, cloud)
-        after.plot(clean[:, 0], clean[:, 1], ".", ms=1.6, mew=0, color=FAINT)
-        _ring(after, 0.0, 0.0, radius, colour, style)
-        last = f"Iron of {method['name']} removed, then levelled"
+        if not shown and None not in method["offsets_mg"]:
+            clean = levelled(away, cloud)
+            after.plot(clean[:, 0], clean[:, 1], ".", ms=size, mew=0, color=FAINT)
+            _ring(after, 0.0, 0.0, radius, colour, style)
+            shown = f"Iron of {method['name']} removed, then levelled"
     for axis, (title, across, up) in zip(
         axes,
         (
             ("Levelled: the circle of headings", "ahead, mG", "right, mG"),
-            (last, "ahead, mG", "right, mG"),
+            (shown or "no method knows all three axes", "ahead, mG", "right, mG"),
             ("Body, from above: outline of the sphere", "y right, mG", "x forward, mG"),
             ("Body, from the side", "x forward, mG", "z down, mG"),
         ),
@@ -119,7 +120,13 @@ def _row(axes: list[Axes], entry: Mapping[str, Any], cloud: Cloud) -> None:
         axis.axvline(0.0, color=INK, lw=0.4)
     beside.invert_yaxis()
     level.legend(
-        loc="upper left", fontsize=7.5, markerscale=4.0, ncols=2, framealpha=0.8, frameon=True, edgecolor="none"
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.13),
+        fontsize=8.0,
+        markerscale=2.0,
+        ncols=5,
+        columnspacing=0.8,
+        handlelength=1.2,
     )
 
 

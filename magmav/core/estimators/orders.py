@@ -22,7 +22,10 @@ from magmav.core.rotation import level_from_body
 from magmav.core.types import Estimate, Sample, mat3, vec3
 
 UNKNOWN_MG = 1000.0
-"""One sigma of a direction a method says nothing about."""
+"""One sigma of a direction a method says nothing about, and of every direction where a method has no sigma.
+
+Where a method has none, a direction it says nothing about has twice as much, so that the two can be told apart.
+"""
 _FOREVER_S = 1e9
 _WILD_MG = 1e6  # a thousand gauss
 
@@ -138,7 +141,7 @@ def _estimate(
     horizontal_mg: float,
     down_mg: float,
 ) -> Estimate:
-    inner = np.eye(3) * UNKNOWN_MG**2 if covariance is None else covariance + unseen * UNKNOWN_MG**2
+    inner = (np.eye(3) + 3.0 * unseen) * UNKNOWN_MG**2 if covariance is None else covariance + unseen * UNKNOWN_MG**2
     iron_covariance = back @ inner @ back.T if covariance is not None else inner
     return Estimate(
         hard_iron_b_mg=vec3(back @ centre, "hard iron"),
