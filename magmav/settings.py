@@ -14,6 +14,8 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from magmav.core.estimators import ESTIMATORS
+from magmav.core.motion import OWN_TILTS
+from magmav.core.published import SMOOTHINGS
 
 
 class SettingsError(ValueError):
@@ -45,6 +47,19 @@ class Compass(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     axes: Annotated[
         int, _knob("3, or 2: only x and y are used, the third comes from the dip of the place", ge=2, le=3)
     ] = 3
+
+
+class Attitude(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where the tilt comes from while the vehicle sends no ATTITUDE; the yaw never teaches anything."""
+
+    own: Annotated[str, _knob("taken at the start: " + ", ".join(OWN_TILTS))] = "marg_gn"
+
+
+class Heading(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How the published heading is made of the measured ones."""
+
+    smooth: Annotated[str, _knob("one of " + ", ".join(SMOOTHINGS) + "; fixed_lag is smoothest and late")] = "off"
+    lag: Annotated[int, _knob("how late fixed_lag publishes", "samples", ge=1, le=200)] = 10
 
 
 class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -103,6 +118,8 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     vehicle: Vehicle = field(default_factory=Vehicle)
     place: Place = field(default_factory=Place)
     compass: Compass = field(default_factory=Compass)
+    attitude: Attitude = field(default_factory=Attitude)
+    heading: Heading = field(default_factory=Heading)
     learn: Learn = field(default_factory=Learn)
     gate: Gate = field(default_factory=Gate)
     wire: Wire = field(default_factory=Wire)
@@ -171,6 +188,12 @@ def checked(settings: Settings, where: str) -> Settings:
         raise SettingsError(f"{where}: place: {place.lat_deg}, {place.lon_deg} is not on Earth")
     if settings.learn.estimator not in ESTIMATORS:
         raise SettingsError(f"{where}: learn.estimator: {settings.learn.estimator!r}; choose {', '.join(ESTIMATORS)}")
+    if settings.attitude.own not in OWN_TILTS:
+        raise SettingsError(f"{where}: attitude.own: {settings.attitude.own!r}; choose {', '.join(OWN_TILTS)}")
+    if settings.heading.smooth not in SMOOTHINGS:
+        raise SettingsError(
+            f"{where}: heading.smooth: {settings.heading.smooth!r}; choose {', '.join(SMOOTHINGS)}"
+        )
     return settings
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magmav.core.marg_attitude import Carried, MargAttitude
 from magmav.core.rotation import euler_rates, level_from_body, tilt_from_force, wrap_pi
 from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Vec3
 
@@ -20,6 +21,10 @@ _RATES_HOLD_S = 0.25  # between attitudes further apart, rates say nothing: take
 _LOST_S = 5.0
 _TILT_TAU_S = 3.0  # accelerometer corrects the gyro's tilt with this time constant
 _G = 9.80665
+
+
+OWN_TILTS = ("marg_gn", "marg_gd", "complementary")
+"""What can give the tilt of a vehicle that sends no attitude: the solvers of core.marg_attitude, or _OwnTilt."""
 
 
 class MotionState(NamedTuple):
@@ -35,15 +40,22 @@ class MotionState(NamedTuple):
 
 
 class Motion:
-    """Keeps the latest tilt of one vehicle."""
+    """Keeps the latest tilt of one vehicle.
 
-    def __init__(self) -> None:
+    own : which of OWN_TILTS gives it where no attitude comes.
+    """
+
+    def __init__(self, own: str = "complementary") -> None:
         self.seen_attitude = False
         self._att: AttitudeReading | None = None
         self._recent: deque[tuple[AttitudeReading, float]] = deque(maxlen=12)  # with the integrated yaw
         self._yaw_rad = 0.0
         self._epoch = 0
-        self._own = _OwnTilt()
+        if own not in OWN_TILTS:
+            raise ValueError(f"own: want one of {', '.join(OWN_TILTS)}, got {own!r}")
+        self._own: _OwnTilt | MargAttitude = _OwnTilt()
+        if own != "complementary":
+            self._own = MargAttitude("gn" if own == "marg_gn" else "gd")
 
     def attitude(self, r: AttitudeReading) -> bool:
         """Take one attitude; False when it is a duplicate or late."""
@@ -73,6 +85,18 @@ class Motion:
         else:
             self._own.step(r)
 
+    def field(self, field_b_mg: Vec3, age_s: float, sigma_rad: float) -> None:
+        """Take a calibrated magnetometer value, (3,) mG, age_s old: it moves own yaw, never tilt or turning.
+
+        sigma_rad : of the heading it gives.
+        """
+        if isinstance(self._own, MargAttitude):
+            self._own.field(field_b_mg, age_s, sigma_rad)
+
+    def magnetic_yaw(self, boot_ns: int) -> float | None:
+        """Own yaw from magnetic north, rad in [0, 2 pi); None where attitudes come or own yaw is not known."""
+        return self._own.magnetic_yaw(boot_ns) if isinstance(self._own, MargAttitude) else None
+
     @property
     def rate_rads(self) -> float:
         """Length of the newest body rate, rad/s, 0 when nothing is known."""
@@ -92,7 +116,10 @@ class Motion:
             dr, dp, dy = euler_rates(a.roll_rad, a.pitch_rad, a.rate_b_rads)
             roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, yaw + dy * age
             return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True)
-        return self._own.at(boot_ns)
+        own = self._own.at(boot_ns)
+        if own is None:
+            return None
+        return MotionState(own.roll_rad, own.pitch_rad, own.yaw_rad, own.rate_b_rads, "OWN", own.epoch, False)
 
 
 class _OwnTilt:
@@ -139,7 +166,7 @@ class _OwnTilt:
     def _tilt(self) -> tuple[float, float]:
         return tilt_from_force(-self._down_b) or (0.0, 0.0)
 
-    def at(self, boot_ns: int) -> MotionState | None:
+    def at(self, boot_ns: int) -> Carried | None:
         """Tilt at a boot time within 0.2 s of the last reading."""
         if self._boot_ns is None or abs(boot_ns - self._boot_ns) > 200_000_000:
             return None
@@ -147,4 +174,4 @@ class _OwnTilt:
         roll, pitch = self._tilt()
         dr, dp, dy = euler_rates(roll, pitch, self.rate_b_rads)
         yaw = self._yaw_rad + dy * age
-        return MotionState(roll + dr * age, pitch + dp * age, yaw, self.rate_b_rads, "OWN", self._epoch, False)
+        return Carried(roll + dr * age, pitch + dp * age, yaw, self.rate_b_rads, self._epoch)
