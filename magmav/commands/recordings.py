@@ -15,6 +15,7 @@ from magmav.commands.common import Refused, progress_bar, settings_of, show, std
 from magmav.core.types import Reading, Record
 from magmav.geomag import world_magnetic_model
 from magmav.settings import SettingsError
+from magmav.view.drawing import check_name
 
 
 def replay(o: argparse.Namespace) -> int:
@@ -30,6 +31,8 @@ def replay(o: argparse.Namespace) -> int:
     if o.every is not None and not o.every > 0.0:
         raise SettingsError(f"--every: want seconds above 0, got {o.every:g}")
     settings = settings_of(o)
+    if o.plot is not None:
+        check_name(o.plot)
     with ExitStack() as stack:
         progress = progress_bar(stack, o.log.name)
         recording = open_recording(o.log, progress)
@@ -80,6 +83,8 @@ def compare(o: argparse.Namespace) -> int:
     from magmav.view.compare import compare_view
 
     settings = settings_of(o)
+    if o.plot is not None:
+        check_name(o.plot)
     only = [] if o.only is None else [name.strip() for name in o.only.split(",")]
     with ExitStack() as stack:
         path, truth = o.log, o.reference
