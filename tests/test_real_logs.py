@@ -1,4 +1,4 @@
-"""Real DataFlash and ULog flights, read where MAGMAV_DATA says they are; others' fits and stored values are the judge."""
+"""Real DataFlash and ULog flights; others' fits and stored values are the judge."""
 
 import json
 import os

@@ -268,7 +268,8 @@ class Estimate:
     samples: int
     changed_ago_s: float  # seconds since the last sudden change was accepted; large when never
     delay_s: float = 0.0  # of the compass, beyond Sample.age_s, as far as the method can tell
-    soft_iron_b: Mat3 = field(default_factory=lambda: IDENTITY3)  # truth is soft_iron_b @ (shaping.matrix @ (sensor - hard iron) + motor)
+    # truth is soft_iron_b @ (shaping.matrix @ (sensor - hard iron) + motor)
+    soft_iron_b: Mat3 = field(default_factory=lambda: IDENTITY3)
 
 
 @dataclass(frozen=True, slots=True)
