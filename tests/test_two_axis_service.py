@@ -105,7 +105,7 @@ def test_the_inverse_of_two_axes_is_exact(seed):
     back = two(vec3((*sent[:2], 0.0), "sent"))
     assert back[:2] == pytest.approx(sensor[:2], abs=1e-8)
     assert back[2] == 0.0
-    again = shaping.matrix @ (back + [*offset[:2], 0.0]) + shaping.motor_b_mg
+    again = shaping.matrix @ (back + np.append(offset[:2], 0.0)) + shaping.motor_b_mg
     assert again[:2] == pytest.approx(sent[:2], abs=1e-8)
 
 
