@@ -139,7 +139,7 @@ def test_two_axes_give_a_circle_in_body_axes(name):
     got = taught(ESTIMATORS[name](), flat, 0.1, -0.05, axes=2).estimate(None)
     assert got.hard_iron_b_mg == pytest.approx([*HARD_IRON_MG[:2], 0.0], abs=0.1)
     assert got.horizontal_mg == pytest.approx(np.hypot(205, 14), abs=0.1)
-    assert got.own_sigma_mg[2] == pytest.approx(1000.0)
+    assert got.own_sigma_mg[2] >= 1000.0
 
 
 # ---------------------------------------------------------------- level order and its cost
