@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 UV_VERSION := 0.13.9
 export UV_PROJECT_ENVIRONMENT := $(CURDIR)/$(VENV)
 
-.PHONY: demo test check soak bench clean
+.PHONY: demo test check soak bench papers clean
 
 $(VENV)/.ready: pyproject.toml uv.lock
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
@@ -31,8 +31,13 @@ test: $(VENV)/.ready
 soak: $(VENV)/.ready
 	$(BIN)/python benchmarks/soak.py
 
+# The second wants a real .bin log and says so (exit 3) where there is none.
 bench: $(VENV)/.ready
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/logs.py || test $$? -eq 3
+
+papers: $(VENV)/.ready
+	$(BIN)/python benchmarks/papers.py
 
 clean:
 	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
