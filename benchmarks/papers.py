@@ -281,8 +281,8 @@ def sytnyk_heading() -> list[Row]:
             "heading error with the Kalman filter, at most",
             "3 deg",
             f"{mid([e.worst for e in kalman]):.1f} deg, worst of {SEEDS} drives {max(e.worst for e in kalman):.1f}",
-            f"Reproduces as a bound for a noise chosen to fit: {SIGMA_DEG} deg on {SAMPLES * STEP_S:.0f} s of turns up to "
-            f"20 deg/s, q = 16 deg^2/s^3, against the truth. Half the noise gives {scaled[0]:.1f}, twice the noise "
+            f"Reproduces as a bound for a noise chosen to fit: {SIGMA_DEG} deg on {SAMPLES * STEP_S:.0f} s of turns up "
+            f"to 20 deg/s, q = 16 deg^2/s^3, against the truth. Half the noise gives {scaled[0]:.1f}, twice the noise "
             f"{scaled[1]:.1f}.",
         ),
         Row(
