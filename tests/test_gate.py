@@ -30,6 +30,7 @@ FINE = Evidence(
     sigma_mg=vec3((2.5, 2.5, 5.8), "sigma"),
     offsets_heading_sigma_rad=math.radians(1.0),
     field_mg=FIELD.total_mg,
+    level_mg=FIELD.horizontal_mg,
     steady=True,
     sectors=8,
     frozen_s=0.0,
@@ -188,3 +189,15 @@ def test_every_reason_has_its_own_number_and_a_plain_sentence():
     assert len(set(numbers)) == len(numbers)
     assert all(0 < n < 100 for n in numbers)
     assert all(r.text[0].islower() or r.text.startswith("ATTITUDE") for r in Reason)
+
+
+def test_where_the_down_axis_is_unknown_only_the_horizontal_field_is_judged():
+    """The length of a field whose third axis is not corrected says nothing."""
+    blind = sigma(2, 2, 400)
+    far_off = {**blind, "field_mg": FIELD.total_mg * 1.9}
+    assert verdict(**far_off).state is State.READY
+    strong = {**blind, "level_mg": FIELD.horizontal_mg + 0.16 * FIELD.total_mg}
+    assert Reason.FIELD_NOT_EARTHLIKE in verdict(**strong).reasons
+    assert verdict(level_mg=FIELD.horizontal_mg + 0.3 * FIELD.total_mg).state is State.READY  # z known: length counts
+    nowhere = {**blind, "expected": None, "level_mg": 30.0}
+    assert Reason.FIELD_NOT_EARTHLIKE in verdict(**nowhere).reasons

@@ -21,7 +21,7 @@ from magmav.core.correction import (
 from magmav.core.estimators import Estimator
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
-from magmav.core.heading import UNKNOWN, heading_sigma, magnetic_heading
+from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
 from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
 _SIGMA_FLOOR_MG = (1.5, 1.5, 5.5)  # a real flight (thor75) missed its batch fit by 12 to 19 mG in z
@@ -96,7 +96,7 @@ class Channel:
         self._excitation = Excitation()
         self._estimate: Estimate | None = None
         self._past: deque[tuple[int, Vec3]] = deque()
-        self._field_mg = 0.0
+        self._field_mg = self._level_mg = 0.0
         self._belief: _Belief | None = None
         self._resume = False
 
@@ -175,6 +175,8 @@ class Channel:
         field_mg = float(np.linalg.norm(corrected))
         weight = _FIELD_WEIGHT if self._field_mg else 1.0
         self._field_mg += weight * (field_mg - self._field_mg)
+        level_mg = math.hypot(*level_field(corrected, s.roll_rad, s.pitch_rad))
+        self._level_mg += weight * (level_mg - self._level_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
             self._past.append((s.boot_ns, e.hard_iron_b_mg))
         while len(self._past) > 1 and s.boot_ns - self._past[1][0] >= self._steady_s * 1e9:
@@ -197,6 +199,7 @@ class Channel:
             sigma_mg=sigma_mg,
             offsets_heading_sigma_rad=offsets_sd,
             field_mg=self._field_mg,
+            level_mg=self._level_mg,
             steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
             sectors=self._excitation.sectors,
             frozen_s=c.frozen_s,

@@ -44,6 +44,7 @@ class Evidence:
     sigma_mg: Vec3
     offsets_heading_sigma_rad: float
     field_mg: float  # mean strength after correction
+    level_mg: float  # and of its horizontal part
     steady: bool
     sectors: int
     frozen_s: float
@@ -84,7 +85,7 @@ def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
     slack = _SLACK if was is State.READY else 1.0
     axes = axis_states(e.estimate.own_sigma_mg, e.sigma_mg, limits.axis_sigma_mg)
     notes = (_Z_NOTE[axes[2]] if e.axes == 3 else (Reason.TWO_AXES,)) + _notes(e)
-    wrong = _wrong(e, e.estimate, limits, slack)
+    wrong = _wrong(e, e.estimate, axes, limits, slack)
     missing = _missing(e, e.estimate, axes, limits, slack)
     if wrong:
         return Verdict(State.REFUSED, axes, wrong + missing + notes)
@@ -93,21 +94,28 @@ def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
     return Verdict(State.READY, axes, notes)
 
 
-def _wrong(e: Evidence, estimate: Estimate, limits: Limits, slack: float) -> tuple[Reason, ...]:
+def _wrong(
+    e: Evidence, estimate: Estimate, axes: tuple[AxisState, ...], limits: Limits, slack: float
+) -> tuple[Reason, ...]:
     """Findings that more data will not heal."""
     out = []
     if e.frozen_s > _FROZEN_S:
         out.append(Reason.FROZEN)
-    if e.expected is None:
-        least, most = _EARTH_MG if e.axes == 3 else _EARTH_LEVEL_MG
-        earthlike = least <= e.field_mg <= most
-    else:
-        earthlike = abs(e.field_mg - e.expected.total_mg) <= limits.field_share * slack * e.expected.total_mg
+    earthlike = _earthlike(e, axes[2] is not AxisState.NOT_OBSERVED, limits.field_share * slack)
     if not earthlike and estimate.samples >= limits.samples:
         out.append(Reason.FIELD_NOT_EARTHLIKE)
     if estimate.residual_mg > limits.residual_mg * slack and estimate.samples >= limits.samples:
         out.append(Reason.RESIDUAL_TOO_LARGE)
     return tuple(out)
+
+
+def _earthlike(e: Evidence, down_known: bool, share: float) -> bool:
+    """Is the corrected field as strong as the Earth's? Where the down axis is not known, only its horizontal part."""
+    if e.expected is not None:
+        off = e.field_mg - e.expected.total_mg if down_known or e.axes == 2 else e.level_mg - e.expected.horizontal_mg
+        return abs(off) <= share * e.expected.total_mg
+    least, most = _EARTH_MG if down_known else _EARTH_LEVEL_MG
+    return least <= (e.field_mg if down_known else e.level_mg) <= most
 
 
 def _missing(

@@ -15,7 +15,7 @@ _WEAKEST_MG = 20.0
 """Under this much horizontal field (within some 2 degrees of a magnetic pole) a direction means nothing."""
 
 
-def _level(field_b_mg: NDArray[np.float64], roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+def level_field(field_b_mg: NDArray[np.float64], roll_rad: float, pitch_rad: float) -> tuple[float, float]:
     """The horizontal field ahead and to the right, mG: rows 1 and 2 of R_lb times the field, in plain numbers."""
     x, y, z = field_b_mg.tolist()
     cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
@@ -27,7 +27,7 @@ def magnetic_heading(field_b_mg: NDArray[np.float64], roll_rad: float, pitch_rad
 
     DEVIATES: the paper prints arctan2(hx, hy); that is the heading plus 90 degrees. Right is atan2(-hy, hx).
     """
-    ahead, right = _level(field_b_mg, roll_rad, pitch_rad)
+    ahead, right = level_field(field_b_mg, roll_rad, pitch_rad)
     if math.hypot(ahead, right) < 1e-9:
         return None
     return wrap_tau(math.atan2(-right, ahead))
@@ -55,7 +55,7 @@ def heading(
     field_b_mg: Vec3, roll_rad: float, pitch_rad: float, sigma_rad: float, declination_rad: float | None
 ) -> Heading:
     """The published heading: invalid where the field is too weak, true only where the declination is known."""
-    ahead, right = _level(field_b_mg, roll_rad, pitch_rad)
+    ahead, right = level_field(field_b_mg, roll_rad, pitch_rad)
     if math.hypot(ahead, right) < _WEAKEST_MG:
         return UNKNOWN
     magnetic = wrap_tau(math.atan2(-right, ahead))
