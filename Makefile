@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 UV_VERSION := 0.13.9
 export UV_PROJECT_ENVIRONMENT := $(CURDIR)/$(VENV)
 
-.PHONY: demo test check soak bench papers clean
+.PHONY: demo test check soak bench papers estimators clean
 
 $(VENV)/.ready: pyproject.toml uv.lock
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
@@ -38,6 +38,9 @@ bench: $(VENV)/.ready
 
 papers: $(VENV)/.ready
 	$(BIN)/python benchmarks/papers.py
+
+estimators: $(VENV)/.ready
+	$(BIN)/python benchmarks/estimators.py
 
 clean:
 	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,159 @@
+"""The results as Markdown and as a JSON document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from estimator_bench.bound import Bound
+from estimator_bench.score import CHECKPOINTS_S, Scored, Summary, as_dict, plain, rms, summed
+
+BOUND = "bound"
+Cell = float | None
+_HONESTY = (
+    "b_xy mG", "b_z mG", "efficiency @178", "NEES", "error/sigma", "to 1 deg s", "again s", "ready s", "ready < 60 s",
+    "ready & > 3 deg", "ready & > 3 sigma", "us", "us < 20 s",
+)  # fmt: skip
+_OVERALL = ("worst @178", "NEES", "error/sigma", "ready & > 3 deg", "ready & > 3 sigma", "ready < 60 s", "us")
+
+
+def number(value: Cell, digits: int = 2) -> str:
+    """For a cell."""
+    if value is None or math.isnan(value):
+        return ""
+    return "-" if math.isinf(value) else f"{value:.{digits}f}"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; the first column is text."""
+    line = "|" + "|".join(["---"] + ["---:"] * (len(head) - 1)) + "|"
+    return "\n".join(["| " + " | ".join(head) + " |", line, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+class Results:
+    """Everything measured. bounds: (scenario, seed) -> Bound, or nothing where they were not wanted."""
+
+    def __init__(self, scored: Sequence[Scored], bounds: dict[tuple[str, int], Bound]) -> None:
+        self.scored = list(scored)
+        self.bounds = bounds
+        self.scenarios = list(dict.fromkeys(s.scenario for s in scored))
+        self.names = list(dict.fromkeys(s.name for s in scored))
+        self.summaries: dict[tuple[str, str], Summary] = {}
+        for scenario in self.scenarios:
+            for name in self.names:
+                some = [s for s in scored if (s.scenario, s.name) == (scenario, name)]
+                if some:
+                    self.summaries[scenario, name] = summed(some)
+
+    def bound_deg(self, scenario: str, i: int) -> Cell:
+        """RMS over seeds of the bound at a checkpoint."""
+        some = [b.heading_deg[i] for (s, _), b in self.bounds.items() if s == scenario]
+        return rms(some) if some else None
+
+    def columns(self, names: Sequence[str] | None = None) -> list[str]:
+        """The bound first, where there is one."""
+        return ([BOUND] if self.bounds else []) + list(names or self.names)
+
+    def error(self, scenario: str, name: str, i: int, offsets_only: bool = False) -> Cell:
+        """RMS over seeds of the heading error at a checkpoint, degrees."""
+        if name == BOUND:
+            return self.bound_deg(scenario, i)
+        s = self.summaries.get((scenario, name))
+        return None if s is None else (s.offsets_deg if offsets_only else s.full_deg)[i]
+
+    # ------------------------------------------------------------ tables
+
+    def heading(self, i: int, offsets_only: bool = False) -> str:
+        """Scenarios by methods at one checkpoint, with median, worst, and how often best."""
+        names = self.columns()
+        cells = {s: {n: self.error(s, n, i, offsets_only) for n in names} for s in self.scenarios}
+        won = dict.fromkeys(names, 0)
+        rows = []
+        for s in self.scenarios:
+            rivals = {n: v for n, v in cells[s].items() if n != BOUND and v is not None}
+            best = min(rivals, key=lambda n: rivals[n], default=None)
+            if best is not None:
+                won[best] += 1
+            rows.append([s, *(f"**{number(v)}**" if n == best else number(v) for n, v in cells[s].items())])
+        for label, fold in (("*median*", np.median), ("*worst*", np.max)):
+            rows.append([label, *(number(_fold(fold, [cells[s][n] for s in self.scenarios])) for n in names)])
+        rows.append(["*scenarios won*", *("" if n == BOUND else str(won[n]) for n in names)])
+        return table(["scenario", *names], rows)
+
+    def honesty(self, name: str) -> str:
+        """One method, scenario by scenario."""
+        head = ["scenario", *_HONESTY]
+        rows = []
+        for s in self.scenarios:
+            if (one := self.summaries.get((s, name))) is None:
+                continue
+            limit = self.bound_deg(s, -1)
+            share = None if limit is None else limit / max(one.full_deg[-1], 1e-9)
+            rows.append(
+                [s, number(one.iron_xy_mg, 1), number(one.iron_z_mg, 1), number(share), number(one.nees, 1),
+                 number(one.ratio), number(one.to_one_degree_s, 0), number(one.again_s, 0), number(one.ready_s, 0),
+                 f"{100 * one.ready_within_60s:.0f} %", f"{100 * one.wrong_share:.2f} %",
+                 f"{100 * one.beyond_share:.2f} %", number(one.us_per_sample, 0), number(one.us_first_20s, 0)]
+            )  # fmt: skip
+        return table(head, rows)
+
+    def overall(self) -> str:
+        """One line a method."""
+        middle = [f"median @{t:.0f}" for t in CHECKPOINTS_S]
+        head = ["method", *middle, *(f"/ bound @{t:.0f}" for t in CHECKPOINTS_S), *_OVERALL]
+        rows = []
+        count = range(len(CHECKPOINTS_S))
+        for name in self.names:
+            some = [self.summaries[s, name] for s in self.scenarios if (s, name) in self.summaries]
+            here = [s.scenario for s in some]
+            middles = [_fold(np.median, [s.full_deg[i] for s in some]) for i in count]
+            limits = [_fold(np.median, [self.bound_deg(s, i) for s in here]) for i in count]
+            shares = [m / b if m is not None and b else None for m, b in zip(middles, limits, strict=True)]
+            runs = [s for s in self.scored if s.name == name]
+            seconds = sum(s.ready_seconds for s in runs)
+            judged = seconds > 0
+            rows.append(
+                [name, *map(number, middles), *map(number, shares), number(max(s.full_deg[-1] for s in some)),
+                 number(_fold(np.median, [s.nees for s in some]), 1), number(rms([r for s in runs for r in s.ratios])),
+                 f"{100 * sum(s.ready_wrong for s in runs) / seconds:.3f} %" if judged else "",
+                 f"{100 * sum(s.ready_beyond for s in runs) / seconds:.3f} %" if judged else "",
+                 f"{100 * np.mean([s.ready_s <= 60 for s in runs]):.0f} %" if judged else "",
+                 number(float(np.mean([s.us_per_sample for s in runs])), 0)]
+            )  # fmt: skip
+        return table(head, rows)
+
+    def markdown(self, notes: Sequence[str], details: Callable[[str], bool]) -> str:
+        """The whole page. details: of which methods the scenario-by-scenario table is wanted."""
+        parts = [*notes, "## All scenarios together\n\n" + self.overall()]
+        for i, t in enumerate(CHECKPOINTS_S):
+            parts.append(f"## Heading error after {t:.0f} s, degrees RMS\n\n" + self.heading(i))
+        soft = [s for s in self.scenarios if any(r.full_deg != r.offsets_deg for r in self.scored if r.scenario == s)]
+        if soft:
+            text = "## The same after 178 s for what an upload of offsets alone gives\n\n"
+            parts.append(text + self.heading(len(CHECKPOINTS_S) - 1, offsets_only=True))
+        parts += [f"## {name}\n\n" + self.honesty(name) for name in self.names if details(name)]
+        return "\n\n".join(parts) + "\n"
+
+    def document(self, facts: dict[str, Any]) -> dict[str, Any]:
+        """For JSON."""
+        bounds = [
+            {"scenario": s, "seed": seed, "heading_deg": list(b.heading_deg), "iron_mg": [list(v) for v in b.iron_mg]}
+            for (s, seed), b in self.bounds.items()
+        ]
+        return plain(
+            {
+                **facts,
+                "checkpoints_s": list(CHECKPOINTS_S),
+                "summaries": [as_dict(s) for s in self.summaries.values()],
+                "runs": [as_dict(s) for s in self.scored],
+                "bounds": bounds,
+            }
+        )  # type: ignore[no-any-return]
+
+
+def _fold(fold: Callable[..., Any], values: Sequence[Cell]) -> Cell:
+    some = [v for v in values if v is not None and not math.isnan(v)]
+    return float(fold(some)) if some else None

@@ -1,0 +1,134 @@
+"""How good the estimators are, how honest, and how far from what theory allows, on flights whose truth is known.
+
+    make estimators        or        estimators.py [--seeds A:B] [--scenarios LIST] [--estimators LIST] ...
+
+Every estimator of the project gets the same Samples, made by magmav's own pipeline from what an autopilot would send,
+with all its errors; estimator_bench says which. Beside them stand methods of other people (--peers) and the posterior
+Cramer-Rao bound of each flight. Tables go to standard output or --markdown, every single run to --json.
+
+Seeds 0 to 999 are for tuning, 1000 and up for judging. Same arguments, same figures (but the microseconds).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from estimator_bench.bound import Bound, bound
+from estimator_bench.running import run, tape
+from estimator_bench.scenarios import SCENARIOS, chosen
+from estimator_bench.score import Scored, score
+from estimator_bench.tables import Results
+from estimator_bench.telemetry import fly
+from rich.console import Console
+
+from magmav.core.estimators import ESTIMATORS
+
+JUDGING = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight to be judged."""
+
+    scenario: str
+    seed: int
+    estimators: tuple[str, ...]
+    bound: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What became of it."""
+
+    task: Task
+    scored: list[Scored]
+    bound: Bound | None
+
+
+def judged(task: Task) -> Judged:
+    """Fly, and run every method over it."""
+    flight = fly(SCENARIOS[task.scenario], task.seed)
+    heard = tape(flight)
+    scored = [score(flight, heard, run(name, heard)) for name in task.estimators]
+    return Judged(task, scored, bound(flight) if task.bound else None)
+
+
+def seeds(text: str) -> range:
+    """A:B, B left out; or how many of the judging seeds. ValueError otherwise."""
+    first, colon, last = text.partition(":")
+    out = range(int(first), int(last)) if colon else range(JUDGING, JUDGING + int(first))
+    if not out or out.start < 0:
+        raise ValueError(f"seeds: want A:B with A < B, or how many, got {text!r}")
+    return out
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Estimators by name. ValueError naming one that does not exist."""
+    out = tuple(ESTIMATORS) if text == "all" else tuple(n for n in text.split(",") if n)
+    for name in out:
+        if name not in ESTIMATORS:
+            raise ValueError(f"no estimator called {name!r}; there are {', '.join(ESTIMATORS)}")
+    return out
+
+
+def measured(tasks: Sequence[Task], jobs: int, console: Console) -> list[Judged]:
+    """All tasks, in the order given, whoever finishes first."""
+    done: dict[Task, Judged] = {}
+
+    def keep(one: Judged) -> None:
+        done[one.task] = one
+        console.print(f"{len(done)} of {len(tasks)}: {one.task.scenario}, seed {one.task.seed}")
+
+    if jobs == 1:
+        for task in tasks:
+            keep(judged(task))
+    else:
+        with ProcessPoolExecutor(jobs) as pool:
+            for future in as_completed([pool.submit(judged, task) for task in tasks]):
+                keep(future.result())
+    return [done[task] for task in tasks]
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    p = argparse.ArgumentParser(prog="estimators.py", description=(__doc__ or "").partition("\n")[0])
+    p.add_argument("--seeds", type=seeds, default=seeds("6"), help="A:B, or how many of the judging seeds (default 6)")
+    p.add_argument("--scenarios", type=chosen, default=chosen("all"), help="names, or all, reference, new")
+    p.add_argument("--estimators", type=names, default=names("all"), help="names, or all")
+    p.add_argument("--no-bound", action="store_true", help="leave the Cramer-Rao bound out (2 s a flight)")
+    p.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
+    p.add_argument("--markdown", type=Path, help="write the tables here instead of to standard output")
+    p.add_argument("--json", type=Path, help="write every single run here")
+    return p.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    a = _arguments(argv)
+    console = Console(stderr=True, highlight=False)
+    tasks = [Task(s.name, seed, a.estimators, not a.no_bound) for s in a.scenarios for seed in a.seeds]
+    got = measured(tasks, max(a.jobs, 1), console)
+    bounds = {(j.task.scenario, j.task.seed): j.bound for j in got if j.bound is not None}
+    results = Results([s for j in got for s in j.scored], bounds)
+    facts: dict[str, Any] = {"seeds": [a.seeds.start, a.seeds.stop], "judging": a.seeds.start >= JUDGING}
+    kind = "judging" if facts["judging"] else "TUNING"
+    note = f"{len(a.seeds)} {kind} seeds ({a.seeds.start} to {a.seeds.stop - 1}), {len(a.scenarios)} scenarios, 180 s."
+    text = results.markdown([note], lambda name: name in ESTIMATORS)
+    if a.markdown is None:
+        print(text)
+    else:
+        a.markdown.write_text(text, encoding="utf-8")
+    if a.json is not None:
+        a.json.write_text(json.dumps(results.document(facts), indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
