@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import Heading, Record, Shaping, State
+from magmav.core.types import Heading, Record, Shaping, State, Vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -109,7 +109,7 @@ def describe(
         "offsets_change_mg": numbers if known and not absolute else None,
         "relative": last.relative,
         "stored": vehicle.calibrations.stored(compass),
-        "hard_iron_mg": [round(float(v), 3) for v in last.estimate.hard_iron_b_mg] if absolute else None,
+        "hard_iron_mg": _known(last.estimate.hard_iron_b_mg, last) if absolute else None,
         "sigma_mg": [round(float(v), 3) for v in last.sigma_mg] if known else None,
         "sigma_by_motion_mg": own if known else None,
         "axes": [a.value for a in last.verdict.axes],
@@ -123,6 +123,11 @@ def describe(
         "samples": len(log),
         "samples_learnt": log.learnt,
     }
+
+
+def _known(vector: Vec3, last: Record) -> list[float | None]:
+    """The vector's numbers; of a two-axis compass the third is not known."""
+    return [round(float(v), 3) if i < last.axes else None for i, v in enumerate(vector)]
 
 
 def scores(
@@ -150,16 +155,19 @@ def scores(
         offsets = log.last.offsets_mg
     else:
         left_out["no heading"] = ~np.isfinite(log.magnetic_rad if magnetic else log.true_rad)
+    down = log.down_mg
+    if log.last.axes == 2 and down is None:
+        left_out["no heading"] = np.ones(len(log), dtype=bool)  # without a dip two axes have none
     calibrations = {
-        "full": Calibration(log.last.estimate.hard_iron_b_mg, log.last.estimate.soft_iron_b @ matrix),
-        "offsets": Calibration(-offsets, matrix),
+        "full": Calibration(log.last.estimate.hard_iron_b_mg, log.last.estimate.soft_iron_b @ matrix, down),
+        "offsets": Calibration(-offsets, matrix, down),
     }
     stored = vehicle.calibrations.offsets(log.last.compass)
     if stored is not None:
-        calibrations["stored"] = Calibration(-stored, matrix)
-    got = score_freeze(
-        measured_s, sensor, calibrations, np.where(unknown, 0.0, declination), reference, window, left_out, log.down_mg
-    )
+        calibrations["stored"] = Calibration(-stored, matrix, down)
+    bare = Calibration(down_mg=down)
+    declination = np.where(unknown, 0.0, declination)
+    got = score_freeze(measured_s, sensor, calibrations, declination, reference, window, left_out, bare)
     if learn_for_s is None:
         live = log.magnetic_rad if magnetic else log.true_rad
         stream = log.stored_magnetic_rad if magnetic else log.stored_true_rad

@@ -16,10 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magmav.core.channel import Channel, Circumstances
+from magmav.core import gate
+from magmav.core.channel import SIGMA_FLOOR_MG, Channel, Circumstances
+from magmav.core.dip import dip_from_model
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.estimators.orders import UNKNOWN_MG
 from magmav.core.field import ExpectedField
+from magmav.core.two_axis import down_from_dip
 from magmav.core.types import Estimate, FieldModel, Sample, Vec3
 from magmav.logs import Recording
 from magmav.pipeline import Pipeline
@@ -74,7 +77,8 @@ class Columns:
     roll_rad: Floats
     pitch_rad: Floats
     learn: NDArray[np.bool_]
-    down_mg: float | None  # of a two-axis compass: the Earth's downward field that stands in for its third
+    axes: int
+    expected: ExpectedField | None  # at the end
     declination_rad: Floats  # NaN where no position was known
 
     @classmethod
@@ -93,9 +97,16 @@ class Columns:
             np.array([s.roll_rad for s in samples]),
             np.array([s.pitch_rad for s in samples]),
             np.array([s.learn for s in samples], dtype=bool),
-            expected[-1].down_mg if samples[-1].axes == 2 and expected[-1] is not None else None,
+            samples[-1].axes,
+            expected[-1],
             np.array([math.nan if e is None else e.declination_rad for e in expected]),
         )
+
+    def down_mg(self, radius_mg: float) -> float | None:
+        """Of a two-axis compass: the downward field its third axis is reckoned from, as the service does it."""
+        if self.axes == 3 or self.expected is None or self.expected.horizontal_mg <= 0.0 or radius_mg <= 0.0:
+            return None
+        return down_from_dip(radius_mg, dip_from_model(self.expected))
 
 
 class _Timed:
@@ -169,7 +180,8 @@ def compare(
     *,
     clock: Callable[[], float],
     source: str | None = None,
-    reference_csv: Path | None = None,
+    reference_csvs: Sequence[Path] = (),
+    reference_name: str | None = None,
     only: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
     tapes: dict[tuple[int, int], Columns] | None = None,
@@ -177,6 +189,7 @@ def compare(
     """The document that ``magmav compare --json`` prints.
 
     clock : seconds, for the cost per sample.  only : names of ESTIMATORS; all when empty.
+    reference_csvs : truth, one file per boot of the vehicle.  reference_name : what to call it in the result.
     tapes : filled with the points each compass was fitted to, for pictures.
     Raises ValueError for an unknown name, NothingToLearnFrom when no compass was heard, TruthError for a bad
     reference file.
@@ -186,7 +199,9 @@ def compare(
     if unknown:
         raise ValueError(f"no estimator called {unknown[0]!r}; there are {', '.join(ESTIMATORS)}")
     source = recording.name if source is None else source
-    truth = None if reference_csv is None else Reference.from_csv(reference_csv)
+    truths = [Reference.from_csv(path) for path in reference_csvs]
+    if reference_name is not None:
+        truths = [replace(truth, name=reference_name) for truth in truths]
     kept: dict[tuple[int, int], Tape] = {}
 
     def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
@@ -212,7 +227,8 @@ def compare(
         columns = Columns.of(tape.heard)
         if tapes is not None:
             tapes[system, compass] = columns
-        reference = keeper.reference(system, truth)
+        boots = vehicle.assembler.reboots - (system in earlier)  # before the one that is judged
+        reference = keeper.reference(system, truths[min(boots, len(truths) - 1)] if truths else None)
         settings_of = (settings, clock)
         outcomes: list[Outcome] = []
         half = first_half(columns)
@@ -220,8 +236,7 @@ def compare(
             progress(f"{source}: compass {compass}, {name}")
             outcomes.append(try_estimator(name, tape.heard, half, *settings_of))
         entry["compasses"].append(_compass(compass, tape, columns, half, outcomes, boot, reference))
-    return {"source": source, "reference_file": None if reference_csv is None else str(reference_csv),
-            "vehicles": list(vehicles.values())}  # fmt: skip
+    return {"source": source, "vehicles": list(vehicles.values())}
 
 
 def first_half(columns: Columns) -> int:
@@ -248,9 +263,11 @@ def _compass(
     crash_ns = boot.phase.crash_ns
     crash_s = math.inf if crash_ns is None else crash_ns / 1e9
     second, name = _score(
-        columns, _calibrations(outcomes, "half", matrix, stored), reference, Window(split_s, crash_s=crash_s)
+        columns, _calibrations(outcomes, "half", columns, matrix, stored), reference, Window(split_s, crash_s=crash_s)
     )
-    whole, _ = _score(columns, _calibrations(outcomes, "whole", matrix, stored), reference, Window(crash_s=crash_s))
+    whole, _ = _score(
+        columns, _calibrations(outcomes, "whole", columns, matrix, stored), reference, Window(crash_s=crash_s)
+    )
     taught = columns.learn.nonzero()[0]
     rows = [_row(o, columns, matrix, second.get(o.name), whole.get(o.name)) for o in outcomes]
     return {
@@ -271,14 +288,21 @@ def _compass(
 
 
 def _calibrations(
-    outcomes: Iterable[Outcome], which: str, matrix: Floats, stored: Vec3 | None
+    outcomes: Iterable[Outcome], which: str, columns: Columns, matrix: Floats, stored: Vec3 | None
 ) -> dict[str, Calibration]:
-    out = {} if stored is None else {"stored": Calibration(-stored, matrix)}
+    bare = _bare(columns)
+    out = {} if stored is None else {"stored": Calibration(-stored, matrix, bare.down_mg)}
     for o in outcomes:
-        estimate: Estimate | None = getattr(o, which)
-        if estimate is not None:
-            out[o.name] = Calibration(estimate.hard_iron_b_mg, estimate.soft_iron_b @ matrix)
+        e: Estimate | None = getattr(o, which)
+        if e is not None:
+            down = columns.down_mg(e.horizontal_mg)
+            out[o.name] = Calibration(e.hard_iron_b_mg, e.soft_iron_b @ matrix, down)
     return out
+
+
+def _bare(columns: Columns) -> Calibration:
+    """No calibration at all."""
+    return Calibration(down_mg=None if columns.expected is None else columns.down_mg(columns.expected.horizontal_mg))
 
 
 def _score(
@@ -287,6 +311,7 @@ def _score(
     """Scores by name, and the reference's name; nothing where there is no reference."""
     if reference is None:
         return {}, None
+    no_dip = columns.axes == 2 and columns.expected is None
     declination = columns.declination_rad
     unknown = ~np.isfinite(declination)
     if unknown.all():
@@ -299,8 +324,8 @@ def _score(
         np.where(unknown, 0.0, declination),
         reference,
         window,
-        {"declination not known": unknown},
-        columns.down_mg,
+        {"declination not known": unknown, "no heading": np.full(len(unknown), no_dip)},
+        _bare(columns),
     )
     return got, reference.name
 
@@ -317,7 +342,7 @@ def _row(
     row |= _both(second, whole)
     if e is None:
         return row
-    sigma = np.sqrt(np.maximum(np.diag(e.covariance_mg2), 0.0))
+    sigma = gate.floored(e, SIGMA_FLOOR_MG)
     says = sigma < (0.9 if o.has_sigma else 1.1) * UNKNOWN_MG
     corrected = (columns.sensor_b_mg[columns.learn] - e.hard_iron_b_mg) @ (e.soft_iron_b @ matrix).T
     length = np.linalg.norm(corrected, axis=1)

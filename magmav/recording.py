@@ -93,7 +93,7 @@ class Keeper:
         if kept and (r.source != kept[0].source or r.boot_ns <= kept[-1].boot_ns):
             return
         kept.append(r)
-        flags = (vehicle.phase.armed, vehicle.phase.aloft(r.boot_ns))
+        flags = (vehicle.phase.armed, vehicle.phase.aloft(r.boot_ns) and vehicle.phase.crash_ns is None)
         self.flags.setdefault(r.system, []).append(flags if vehicle.phase.flyer else (True, True))
 
     def _record(self, record: Record, vehicle: Vehicle) -> None:

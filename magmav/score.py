@@ -67,10 +67,14 @@ EVERYTHING = Window()
 
 
 class Calibration(NamedTuple):
-    """truth = matrix @ (sensor - hard iron). The hard iron is (3,), or (N, 3) where it follows current."""
+    """truth = matrix @ (sensor - hard iron). The hard iron is (3,), or (N, 3) where it follows current.
+
+    down_mg : for a two-axis compass, the Earth's downward field that its third axis is reckoned from.
+    """
 
     hard_iron_b_mg: ArrayLike = ZERO3
     matrix: ArrayLike = IDENTITY3
+    down_mg: float | None = None
 
 
 def magnetic_heading_rad(field_b_mg: ArrayLike, roll_rad: ArrayLike, pitch_rad: ArrayLike) -> Floats:
@@ -179,16 +183,15 @@ def score_freeze(
     reference: Reference,
     window: Window = EVERYTHING,
     leave_out: Mapping[str, ArrayLike] | None = None,
-    down_mg: float | None = None,
+    uncalibrated: Calibration | None = None,
 ) -> dict[str, HeadingScore]:
     """Scores of frozen calibrations, and "uncalibrated", applied to the sensor's own field (N, 3) mG.
 
     Declination is scalar or (N,), rad. All are scored on the same samples with the reference's tilt.
-    down_mg : for a two-axis compass, the Earth's downward field that stands in for the third axis.
     """
     raw, at = _vectors(mag_b_mg, "mag_b_mg"), reference.interpolate(boot_s)
     headings: dict[str, Floats] = {}
-    for name, (hard_iron, matrix) in {"uncalibrated": Calibration(), **calibrations}.items():
+    for name, (hard_iron, matrix, down_mg) in {"uncalibrated": uncalibrated or Calibration(), **calibrations}.items():
         offset, shape = np.asarray(hard_iron, dtype=np.float64), np.asarray(matrix, dtype=np.float64)
         if offset.shape not in ((3,), raw.shape) or shape.shape != (3, 3):
             raise ValueError(f"{name}: want hard iron (3,) or {raw.shape} and a (3, 3) matrix")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from magmav.cli import main
+from magmav.commands.recordings import by_boot
 from magmav.view.plot_compare import Cloud, levelled, plot_compare, thinned
 from magmav.view.records import ViewError
 
@@ -18,7 +19,7 @@ def test_a_scenario_is_flown_and_judged_by_its_truth(capsys, tmp_path):
     result = json.loads(out.out)
     assert result["source"] == "figure8"
     for compass, truth in zip(result["vehicles"][0]["compasses"], IRON_MG, strict=True):
-        assert compass["reference"] == "file truth.csv"
+        assert compass["reference"] == "the simulator's truth"
         for row in compass["estimators"]:
             assert row["offsets_mg"] == pytest.approx([-v for v in truth], abs=12.0)
             assert row["second_half"]["rms_deg"] < 2.0 < 30.0 < compass["uncalibrated"]["second_half"]["rms_deg"]
@@ -34,6 +35,9 @@ IRON_MG = ((180.0, -120.0, 240.0), (-150.0, 90.0, -200.0))
     [
         (["no_such_flight"], 3, "no_such_flight"),
         (["figure8", "--only", "oracle"], 2, "oracle"),
+        (["figure8", "--reference", "no_such.csv"], 2, "figure8"),
+        (["no_such.tlog", "--seed", "3"], 2, "--seed"),
+        (["nodir/figure8"], 3, "nodir"),
         (["figure8", "--plot", "c.jpg", "--only", "kasa"], 3, "c.jpg"),
     ],
 )
@@ -41,6 +45,20 @@ def test_what_cannot_be_done_is_refused_by_name(words, code, says, capsys):
     assert main(["compare", *words, "--json"]) == code
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["code"] == code and says in error["text"]
+
+
+def test_a_flight_with_a_reboot_is_judged_by_the_boot_that_taught(capsys):
+    assert main(["compare", "reboot_in_flight", "--only", "kalman", "--json"]) == 0
+    first = capsys.readouterr().out
+    (compass,) = json.loads(first)["vehicles"][0]["compasses"][:1]
+    assert compass["estimators"][0]["in_sample"]["rms_deg"] < 6.0 < compass["uncalibrated"]["in_sample"]["rms_deg"]
+
+
+def test_truth_is_cut_where_the_vehicle_started_anew(tmp_path):
+    (tmp_path / "truth.csv").write_text("boot_time_s,roll_deg\n1.0,0\n2.0,0\n0.5,7\n0.6,7\n")
+    first, second = by_boot(tmp_path / "truth.csv")
+    assert first.read_text() == "boot_time_s,roll_deg\n1.0,0\n2.0,0\n"
+    assert second.read_text() == "boot_time_s,roll_deg\n0.5,7\n0.6,7\n"
 
 
 def cloud(n=900, iron=(120.0, -60.0, 200.0), seed=1):

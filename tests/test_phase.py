@@ -241,3 +241,31 @@ def test_a_crash_stands_in_its_flight():
     for tenth in range(50, 80):
         phase.tilt(math.pi, 0.0, tenth * S // 10)
     assert phase.flights[0].as_seconds()["crash_s"] == phase.crash_ns / S == 5.0
+
+
+def test_what_does_not_fly_takes_off_nowhere():
+    """A rover up a hill, and one armed for a minute with no height known: flights there are only of what flies."""
+    uphill, blind = Phase(), Phase()
+    for phase in (uphill, blind):
+        beat(phase, kind=ROVER)
+    told(uphill, 30.0, lambda now: now)
+    for tenth in range(600):
+        blind.learnable(tenth * S // 10, False)
+    for phase in (uphill, blind):
+        assert phase.takeoff_ns is None
+        assert [f.takeoff_ns for f in phase.flights] == [None]
+
+
+def test_a_mended_vehicle_learns_again():
+    phase = Phase()
+    beat(phase)
+    told(phase, 5.0, lambda now: 20.0)
+    for tenth in range(50, 80):
+        phase.tilt(math.pi, 0.0, tenth * S // 10)
+    assert not phase.learnable(8 * S, False)
+    beat(phase, armed=False, at_s=60.0)
+    phase.tilt(0.0, 0.0, 61 * S)
+    beat(phase, at_s=600.0)
+    at_height(phase, 20.0, 610.0)
+    assert phase.learnable(610 * S, False)
+    assert [f.crash_ns is None for f in phase.flights] == [False, True]

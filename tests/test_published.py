@@ -80,6 +80,26 @@ def test_what_is_not_known_is_not_published_and_what_was_before_is_forgotten(smo
     assert [h for h, _ in out[21:]] == [fresh.step(ns(21 + i), h, NOISE)[0] for i, h in enumerate(headings[20:])]
 
 
+@pytest.mark.parametrize("smoothing", SMOOTHINGS)
+def test_after_a_silence_nothing_from_before_it_goes_out_as_new(smoothing):
+    """S12: a minute without a compass, and then the window of before it is final: but it is a minute old."""
+    headings, _ = turning(80)
+    publisher = Publisher(smoothing)
+    for i, h in enumerate(headings[:40]):
+        publisher.step(ns(i), h, NOISE)
+    for i, h in enumerate(headings[40:]):
+        now = ns(640 + i)
+        got, at = publisher.step(now, h, NOISE)
+        assert not got.valid or now - at < 1.5e9
+
+
+def test_a_lag_of_minutes_is_never_published_as_the_heading():
+    publisher = Publisher("fixed_lag", lag=200)
+    headings, _ = turning(400)
+    out = [publisher.step(round(i * 0.5e9), h, NOISE) for i, h in enumerate(headings)]
+    assert not any(h.valid for h, _ in out)
+
+
 def test_the_service_publishes_what_the_setting_says():
     """Same flight, three settings: measured headings are bit for bit the same, published ones are not."""
     frames = flight(seconds=20.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 import time
@@ -86,11 +87,16 @@ def compare(o: argparse.Namespace) -> int:
     if o.plot is not None:
         check_name(o.plot)
     only = [] if o.only is None else [name.strip() for name in o.only.split(",")]
+    simulated = str(o.log) in scenario_files() and not o.log.is_file()
+    if simulated and o.reference is not None:
+        raise SettingsError(f"--reference: {o.log} is a simulated flight and is judged by its own truth")
+    if not simulated and o.seed is not None:
+        raise SettingsError(f"--seed: only a scenario has one, and {o.log} is none of {', '.join(scenario_files())}")
     with ExitStack() as stack:
-        path, truth = o.log, o.reference
-        if not path.exists() and path.name in scenario_files():
+        path, truth = o.log, [] if o.reference is None else [o.reference]
+        if simulated:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="magmav-compare-")))
-            path, truth = flown(path.name, folder, o.seed)
+            path, truth = flown(str(o.log), folder, o.seed)
         recording = open_recording(path, progress_bar(stack, o.log.name))
         stack.callback(recording.close)
         console = stderr_console()
@@ -101,7 +107,8 @@ def compare(o: argparse.Namespace) -> int:
             world_magnetic_model,
             clock=time.perf_counter,
             source=str(o.log),
-            reference_csv=truth,
+            reference_csvs=truth,
+            reference_name="the simulator's truth" if simulated else None,
             only=only,
             progress=lambda text: console.print(text, style="dim"),
             tapes=tapes,
@@ -117,12 +124,29 @@ def compare(o: argparse.Namespace) -> int:
     return 0
 
 
-def flown(scenario: str, folder: Path, seed: int | None) -> tuple[Path, Path]:
-    """A simulated flight on file: the recording, and its truth as a reference file."""
+def flown(scenario: str, folder: Path, seed: int | None) -> tuple[Path, list[Path]]:
+    """A simulated flight on file: the recording, and its truth as reference files, one per boot."""
     from magmav_sim.__main__ import main as simulate
 
     path = folder / f"{scenario}.tlog"
     words = [scenario, "--write", str(path), "--truth", str(folder)]
     if simulate(words if seed is None else [*words, "--seed", str(seed)]) != 0:
         raise Refused(f"{scenario}: the simulated flight could not be flown")
-    return path, folder / "truth.csv"
+    return path, by_boot(folder / "truth.csv")
+
+
+def by_boot(truth: Path) -> list[Path]:
+    """The simulator's truth cut where its boot time begins again."""
+    header, *rows = truth.read_text(encoding="utf-8").splitlines()
+    boots: list[list[str]] = []
+    before = math.inf
+    for row in rows:
+        now = float(row.split(",", 1)[0])
+        if now <= before:
+            boots.append([header])
+        boots[-1].append(row)
+        before = now
+    out = [truth.with_name(f"truth_{number}.csv") for number in range(len(boots))]
+    for path, lines in zip(out, boots, strict=True):
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return out

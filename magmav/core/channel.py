@@ -24,7 +24,7 @@ from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
 from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
-_SIGMA_FLOOR_MG = (1.5, 1.5, 5.5)  # a real flight (thor75) missed its batch fit by 12 to 19 mG in z
+SIGMA_FLOOR_MG = (1.5, 1.5, 5.5)  # a real flight (thor75) missed its batch fit by 12 to 19 mG in z
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
 _GUESS_RAD = math.radians(45.0)  # a heading less sure than this is not published
@@ -146,7 +146,7 @@ class Channel:
         e = self._estimate or _NO_ESTIMATE
         if s.learn and self._estimate is not None:
             self._follow(s, e, c.expected)
-        sigma = gate.floored(e, _SIGMA_FLOOR_MG)
+        sigma = gate.floored(e, SIGMA_FLOOR_MG)
         horizontal, down = field_of(e, c.expected)
         covariance = covariance_of_field(s, e)
         tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD

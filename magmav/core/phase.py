@@ -52,7 +52,6 @@ class Phase:
         self.armed = False
         self.takeoff_ns: int | None = None
         self._first_ns: int | None = None
-        self.crash_ns: int | None = None
         self.flights: list[Flight] = []
         self._low_since_ns: int | None = None
         self._landed: Landed | None = None
@@ -99,6 +98,8 @@ class Phase:
     def aloft(self, boot_ns: int) -> bool:
         """Armed, in the air and at least 5 m up. Also remembers the first moment it was so."""
         up = self.armed and self._landed is not Landed.ON_GROUND and self._high(boot_ns)
+        if not self.flyer:
+            return up
         if up and self.takeoff_ns is None:
             self.takeoff_ns = boot_ns
         if up:
@@ -150,8 +151,13 @@ class Phase:
             self._over_since_ns = None
         elif self._over_since_ns is None:
             self._over_since_ns = boot_ns
-        elif self.crash_ns is None and boot_ns - self._over_since_ns > _CRASH_S * 1e9:
-            self.crash_ns = self.flights[-1].crash_ns = self._over_since_ns
+        elif self.flights[-1].crash_ns is None and boot_ns - self._over_since_ns > _CRASH_S * 1e9:
+            self.flights[-1].crash_ns = self._over_since_ns
+
+    @property
+    def crash_ns(self) -> int | None:
+        """Of the last flight; an earlier crash was mended and flown again."""
+        return self.flights[-1].crash_ns if self.flights else None
 
     def learnable(self, boot_ns: int, on_ground: bool) -> bool:
         """Does time at this boot time teach? ``on_ground`` is the operator saying that it always does."""
@@ -160,6 +166,6 @@ class Phase:
             self._first_ns = boot_ns if self._first_ns is None else self._first_ns
             if boot_ns - self._first_ns < _WHO_S * 1e9:
                 return on_ground  # it may yet say that it flies, and stand on steel now
-        if self.crash_ns is not None:
+        if self.flights and self.flights[-1].crash_ns is not None:
             return False
         return aloft or on_ground or not self.flyer

@@ -16,6 +16,8 @@ from magmav.core.types import Estimate, Heading
 
 SMOOTHINGS = ("off", "kalman", "fixed_lag")
 _LEAST_NOISE_RAD = math.radians(0.1)
+_OLDEST_S = 3.0
+"""A heading later than this is not published: it would look like one of now (S12)."""
 
 
 def noise_of_heading(e: Estimate, horizontal_mg: float) -> float:
@@ -47,7 +49,9 @@ class Publisher:
         if self.smoothing == "kalman":
             return self._as(self._live.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad), heading)
         final = self._late.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad)
-        return self._as(final[-1], heading) if final else (UNKNOWN, boot_ns)
+        if not final or boot_ns / 1e9 - final[-1].boot_s > _OLDEST_S:
+            return UNKNOWN, boot_ns
+        return self._as(final[-1], heading)
 
     @staticmethod
     def _as(s: Smoothed, now: Heading) -> tuple[Heading, int]:
