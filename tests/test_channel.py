@@ -10,9 +10,10 @@ from synthetic_flight import HARD_IRON_MG
 from test_kalman import yaw_only
 
 from magmav.core.channel import Channel, Circumstances
+from magmav.core.correction import iron_of_offsets
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.gate import Limits
-from magmav.core.types import AxisState, Reason, State
+from magmav.core.types import IDENTITY3, AxisState, Reason, Shaping, State, mat3, vec3
 
 LIMITS = Limits(10.0, math.radians(3.0), 30.0, 0.15, 15.0, 100)
 HERE = Circumstances(EXPECTED, relative=False, assumed=False, parameters_changed=False, grounded=False, frozen_s=0.0)
@@ -181,3 +182,20 @@ def test_the_other_estimators_go_the_same_way(name):
     assert np.all(np.abs(last.offsets_mg + HARD_IRON_MG)[:2] < 60.0)
     assert last.verdict.state in (State.LEARNING, State.READY, State.REFUSED)
     assert last.verdict.axes[2] is (AxisState.NOT_OBSERVED if name == "bullock_level" else AxisState.OBSERVED)
+
+
+def test_offsets_alone_take_the_share_of_soft_iron_that_stands_still_when_level():
+    """Level, at every heading: what is left after the best constant averages to nothing, in all three axes."""
+    bend = np.array([[1.05, 0.02, -0.04], [0.02, 0.96, 0.03], [-0.04, 0.03, 1.01]])  # what the sensor makes of a field
+    stored = np.diag((1.1, 0.9, 1.0))
+    s = replace(samples("figure eight", 1, seconds=1.0)[0], shaping=Shaping(mat3(stored, "m"), vec3((0, 0, 0), "e")))
+    e = run(samples("figure eight", 1, seconds=20.0))[-1].estimate
+    e = replace(e, soft_iron_b=mat3(np.linalg.inv(bend), "s"))
+    iron = iron_of_offsets(s, e, EXPECTED)
+    turn = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+    h, v = EXPECTED.horizontal_mg, EXPECTED.down_mg
+    truth = np.stack((h * np.cos(turn), -h * np.sin(turn), np.full(360, v)), 1)
+    sensor = np.linalg.solve(stored, (truth @ bend.T).T).T + e.hard_iron_b_mg
+    left = (sensor - iron) @ stored.T - truth
+    assert left.mean(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert iron_of_offsets(s, replace(e, soft_iron_b=IDENTITY3), EXPECTED) is e.hard_iron_b_mg

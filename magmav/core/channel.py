@@ -14,6 +14,7 @@ from magmav.core.correction import (
     corrected_field,
     covariance_of_field,
     field_of,
+    iron_of_offsets,
     published,
     stored_heading,
     turned_on,
@@ -153,7 +154,7 @@ class Channel:
         self._belief = _Belief(
             s.boot_ns,
             e,
-            vec3(-e.hard_iron_b_mg, "offsets"),
+            vec3(-iron_of_offsets(s, e, c.expected), "offsets"),
             sigma,
             heading_sigma(covariance, horizontal, down, s.roll_rad, s.pitch_rad, tilt_sigma),
             covariance,

@@ -13,7 +13,7 @@ from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
 from magmav.core.heading import UNKNOWN, heading
 from magmav.core.rotation import euler_rates, wrap_tau
 from magmav.core.two_axis import Doubts, down_from_dip, heading_of_two_axes, vertical_component
-from magmav.core.types import Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
+from magmav.core.types import IDENTITY3, Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
 
 _LEAST_LEVEL = 0.05  # of what two axes see of the level plane; 1 when both lie in it
 _WEAKEST_MG = 20.0  # a circle smaller than this is none
@@ -26,6 +26,19 @@ def corrected_field(s: Sample, e: Estimate, expected: ExpectedField | None) -> V
     """
     field: Vec3 = e.soft_iron_b @ (s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg)
     return field if s.axes == 3 else with_third(field, s, _radius(e, expected), expected)
+
+
+def iron_of_offsets(s: Sample, e: Estimate, expected: ExpectedField | None) -> Vec3:
+    """The hard iron that offsets alone should take away, (3,) mG: with the soft iron's share of a level vehicle.
+
+    Held level, soft iron bends the downward field into a constant that looks like hard iron; the rest turns with the
+    heading and no offset can take it (estimation.md section 5). Without soft iron it is the hard iron itself.
+    """
+    if np.array_equal(e.soft_iron_b, IDENTITY3):
+        return e.hard_iron_b_mg
+    bent = np.linalg.inv(e.soft_iron_b)[:, 2] * field_of(e, expected)[1]
+    bent[2] -= field_of(e, expected)[1]
+    return vec3(e.hard_iron_b_mg + np.linalg.solve(s.shaping.matrix, bent), "hard iron")
 
 
 def with_third(field_b_mg: Vec3, s: Sample, radius_mg: float, expected: ExpectedField | None) -> Vec3:
