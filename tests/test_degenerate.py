@@ -144,6 +144,17 @@ def test_an_estimator_that_answers_has_no_excuse(name):
     assert e.estimate(None) is not None and e.why_not() is None
 
 
+@pytest.mark.parametrize("name", [n for n in FITTED if n not in ("ellipsoid", "sytnyk")])
+def test_an_estimator_that_rests_on_little_says_so(name):
+    """A circle is weak under half a turn, an ellipse under three quarters; a refusal is not weak besides."""
+    degrees = 270.0 if name.startswith("minmax") else 220.0 if name == "ellipse" else 150.0
+    for turned, weak in ((degrees, True), (360.0, False), (0.0, False)):
+        flat = ring(300, 200.0, (310.0, -140.0), turned, noise=1.0, seed=1)
+        e = taught(ESTIMATORS[name](), np.column_stack((flat, np.full(300, 650.0))))
+        assert (e.why_weak() is not None) is weak
+        assert (e.estimate(None) is None) is (turned == 0.0)
+
+
 @pytest.mark.parametrize("name", FITTED)
 def test_values_beyond_any_compass_teach_nothing(name):
     """A stored matrix may be anything at all: no overflow, no trace of it later."""

@@ -124,6 +124,12 @@ def test_a_compass_that_lags_is_found_out(delay_samples):
     assert np.abs(got.hard_iron_b_mg - HARD_IRON_MG).max() < 8.0
 
 
+def test_a_compass_of_two_axes_says_nothing_of_its_third():
+    flight = samples("figure eight", 4)
+    assert learnt(flight).estimate(EXPECTED).says_b == (True, True, True)
+    assert learnt([replace(s, axes=2) for s in flight]).estimate(EXPECTED).says_b == (True, True, False)
+
+
 # ------------------------------------------------------------ honest sigmas
 
 SEEDS = range(40)

@@ -84,6 +84,30 @@ def test_level_turns_give_the_two_level_axes_and_leave_the_third_alone(name, noi
     assert axis_states(got.own_sigma_mg, got.own_sigma_mg, 100.0)[2] is AxisState.NOT_OBSERVED
 
 
+@pytest.mark.parametrize("name", [*BODY, *LEVEL, "minmax", "minmax_level", "sytnyk"])
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.2])
+def test_an_axis_nothing_is_said_of_is_known_as_such_whatever_the_stored_matrix(name, scale):
+    """The sigma that stands for "unknown" is divided by the matrix: at 1.2 it reads 833."""
+    shaping = Shaping(mat3(scale * np.eye(3), "m"), vec3((0, 0, 0), "motor"))
+    level = taught(ESTIMATORS[name](), turns(noise_mg=2.0), shaping=shaping).estimate(None)
+    assert level.says_b == (True, True, False)
+    assert np.all(level.own_sigma_mg[:2] < 10.0) or not ESTIMATORS[name]().has_sigma
+
+
+@pytest.mark.parametrize("name", [*BODY, "ellipsoid", "minmax"])
+def test_a_tumble_says_something_of_every_axis(name):
+    assert taught(ESTIMATORS[name](), ball(300, noise=2.0)).estimate(None).says_b == (True, True, True)
+
+
+@pytest.mark.parametrize("name", ["bullock", "bullock_level", "taubin"])
+def test_the_silent_axis_is_the_one_that_points_down(name):
+    """A compass whose y axis points down: level turns say nothing of y. An autopilot's matrix mixes axes likewise."""
+    swap = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    shaping = Shaping(mat3(swap, "m"), vec3((0, 0, 0), "motor"))
+    got = taught(ESTIMATORS[name](), turns(noise_mg=2.0) @ swap, shaping=shaping).estimate(None)
+    assert got.says_b == (True, False, True)
+
+
 @pytest.mark.parametrize("name", ["bullock", "bullock_level"])
 def test_a_steady_lean_leaves_earths_down_direction_unknown(name):
     """Both orders: what lies in the plane of the turn comes back, and the doubt points across it, whatever its way."""
@@ -137,6 +161,7 @@ def test_two_axes_give_a_circle_in_body_axes(name):
     """z is nothing at all, whatever the tilt says; so the circle is found without levelling."""
     flat = turns() * (1.0, 1.0, 0.0)
     got = taught(ESTIMATORS[name](), flat, 0.1, -0.05, axes=2).estimate(None)
+    assert got.says_b == (True, True, False)
     assert got.hard_iron_b_mg == pytest.approx([*HARD_IRON_MG[:2], 0.0], abs=0.1)
     assert got.horizontal_mg == pytest.approx(np.hypot(205, 14), abs=0.1)
     assert got.own_sigma_mg[2] >= 1000.0

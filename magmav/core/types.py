@@ -256,6 +256,7 @@ class Estimate:
     covariance_mg2 : (3, 3) with everything used; own_sigma_mg : (3,) from motion alone, without the field model.
     field_l_mg : (2,) horizontal and downward field the data imply, mG; residual_mg : RMS of the fit, mG.
     step_nis : normalised innovation squared per axis, averaged over the last seconds (1 is ideal).
+    says_b : of which of the sensor's axes the method says anything at all; where not, value and sigma mean nothing.
     """
 
     hard_iron_b_mg: Vec3
@@ -270,6 +271,7 @@ class Estimate:
     delay_s: float = 0.0  # of the compass, beyond Sample.age_s, as far as the method can tell
     # truth is soft_iron_b @ (shaping.matrix @ (sensor - hard iron) + motor)
     soft_iron_b: Mat3 = field(default_factory=lambda: IDENTITY3)
+    says_b: tuple[bool, bool, bool] = (True, True, True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from magmav.core.types import Estimate, Sample
 
 
 class Estimator(Protocol):
-    """What every method offers. Those made by ``fitted`` also have why_not() -> str | None and has_sigma."""
+    """What every method offers. Those made by ``fitted`` also have has_sigma and why_not, why_weak() -> str | None."""
 
     def step(self, sample: Sample) -> None:
         """Learn from one sample (or only carry time forward, where sample.learn is False)."""

@@ -27,6 +27,10 @@ class Refusal(Enum):
     NOT_AN_ELLIPSE = "no ellipse fits: not turned all the way round, or disturbed, or tilted too far to level first"
 
 
+WEAK = "rests on so short an arc that a little noise or soft iron moves it far: turn the vehicle further, and bank it"
+"""What ``Fit.weak`` means, as a sentence."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """A circle, sphere, ellipse or ellipsoid: |matrix @ (point - centre)| = radius in the seen directions.

@@ -136,6 +136,7 @@ class KalmanEstimator:
         self._bad_s = 0.0
         self._since_change_s = 1e9
         self._innovation_mg = np.zeros(3)
+        self._axes = 3
 
     def step(self, sample: Sample) -> None:
         """Carry the state to this sample's time and, where the time teaches, learn from it."""
@@ -186,7 +187,7 @@ class KalmanEstimator:
         roll, pitch, removed = self._tilt.calmed(s, n)
         body_from_level = level_from_body(roll, pitch).T
         level_field = self._x[_H] + self._x[_D]
-        k = s.axes
+        k = self._axes = s.axes
         predicted, H = measurement(s, body_from_level, self._x[_B], level_field, float(self._x[_T]))
         predicted, H = predicted[:k], H[:k]
         z = (s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg)[:k]
@@ -253,6 +254,7 @@ class KalmanEstimator:
             samples=self._samples,
             delay_s=float(self._x[_T]),
             changed_ago_s=self._since_change_s,
+            says_b=(True, True, self._axes == 3),
         )
 
     def _with_model(self, x: Array, P: Array, expected: ExpectedField) -> tuple[Array, Array]:
