@@ -126,8 +126,8 @@ def describe(
 
 
 def _known(vector: Vec3, last: Record) -> list[float | None]:
-    """The vector's numbers; of a two-axis compass the third is not known."""
-    return [round(float(v), 3) if i < last.axes else None for i, v in enumerate(vector)]
+    """The vector's numbers, for the axes the method says anything about: not the third of a two-axis compass."""
+    return [round(float(v), 3) if says else None for v, says in zip(vector, last.estimate.says_b, strict=True)]
 
 
 def scores(

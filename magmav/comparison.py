@@ -20,7 +20,6 @@ from magmav.core import gate
 from magmav.core.channel import SIGMA_FLOOR_MG, Channel, Circumstances
 from magmav.core.dip import dip_from_model
 from magmav.core.estimators import ESTIMATORS, Estimator
-from magmav.core.estimators.orders import UNKNOWN_MG
 from magmav.core.field import ExpectedField
 from magmav.core.two_axis import down_from_dip
 from magmav.core.types import Estimate, FieldModel, Sample, Vec3
@@ -139,6 +138,7 @@ class Outcome:
     state: str
     reasons: tuple[str, ...]
     refusal: str | None
+    weak: str | None
     has_sigma: bool
 
 
@@ -160,7 +160,7 @@ def try_estimator(
         channel.learn(sample, circumstances)
     timed = made[-1]
     whole = timed.estimate(heard[-1].circumstances.expected)
-    why = getattr(timed.inner, "why_not", None)
+    why, why_weak = getattr(timed.inner, "why_not", None), getattr(timed.inner, "why_weak", None)
     return Outcome(
         name=name,
         half=first,
@@ -168,6 +168,7 @@ def try_estimator(
         us_per_sample=1e6 * timed.spent_s / len(heard),
         state=channel.verdict.state.name,
         reasons=tuple(r.name for r in channel.verdict.reasons),
+        weak=None if whole is None or why_weak is None else why_weak(),
         refusal=None if whole is not None else (None if why is None else why()) or "too little data",
         has_sigma=bool(getattr(timed.inner, "has_sigma", True)),
     )
@@ -338,22 +339,24 @@ def _row(
     row: Result = {"name": o.name, "state": o.state, "reasons": list(o.reasons), "refusal": o.refusal}
     row |= {"us_per_sample": round(o.us_per_sample, 2), "samples": 0 if e is None else e.samples}
     row |= dict.fromkeys(("offsets_mg", "sigma_mg", "soft_iron", "residual_mg", "length_rms_mg"))
-    row["half_offsets_mg"] = None if o.half is None else (-o.half.hard_iron_b_mg).round(2).tolist()
+    row["half_offsets_mg"] = None if o.half is None else _said(-o.half.hard_iron_b_mg, o.half)
+    row["weak"] = o.weak
     row |= _both(second, whole)
     if e is None:
         return row
-    sigma = gate.floored(e, SIGMA_FLOOR_MG)
-    says = sigma < (0.9 if o.has_sigma else 1.1) * UNKNOWN_MG
     corrected = (columns.sensor_b_mg[columns.learn] - e.hard_iron_b_mg) @ (e.soft_iron_b @ matrix).T
     length = np.linalg.norm(corrected, axis=1)
-    row["offsets_mg"] = [round(-float(v), 2) if s else None for v, s in zip(e.hard_iron_b_mg, says, strict=True)]
-    row["sigma_mg"] = (
-        [round(float(v), 2) if s else None for v, s in zip(sigma, says, strict=True)] if o.has_sigma else None
-    )
+    row["offsets_mg"] = _said(-e.hard_iron_b_mg, e)
+    row["sigma_mg"] = _said(gate.floored(e, SIGMA_FLOOR_MG), e) if o.has_sigma else None
     row["soft_iron"] = None if np.array_equal(e.soft_iron_b, np.eye(3)) else e.soft_iron_b.round(4).tolist()
     row["residual_mg"] = round(e.residual_mg, 2)
-    row["length_rms_mg"] = round(float(length.std()), 2) if len(length) and bool(says.all()) else None
+    row["length_rms_mg"] = round(float(length.std()), 2) if len(length) and all(e.says_b) else None
     return row
+
+
+def _said(vector: Vec3, e: Estimate) -> list[float | None]:
+    """The numbers of the axes the method says anything about."""
+    return [round(float(v), 2) if says else None for v, says in zip(vector, e.says_b, strict=True)]
 
 
 def _both(second: HeadingScore | None, whole: HeadingScore | None) -> Result:

@@ -79,6 +79,9 @@ def _why(rows: Sequence[Json]) -> list[str]:
     for row in rows:
         if row["refusal"] is not None:
             said.setdefault(f"no answer: {row['refusal']}", []).append(row["name"])
-        elif row["state"] != "READY":
+            continue
+        if row["weak"] is not None:
+            said.setdefault(f"weak: {row['weak']}", []).append(row["name"])
+        if row["state"] != "READY":
             said.setdefault(", ".join(row["reasons"]), []).append(row["name"])
     return [f"{', '.join(names)}: {why}" for why, names in said.items()]
