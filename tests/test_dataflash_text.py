@@ -55,6 +55,16 @@ def test_a_greeting_a_cut_line_and_a_word_for_a_number_cost_themselves() -> None
     assert tables.counts == {"EV: line cut short": 1, "lines of a message never defined": 2}
 
 
+def test_a_byte_order_mark_costs_nothing(tmp_path: Path) -> None:
+    """Notepad puts one there; without care the first line, which may be a definition, is lost to it."""
+    log = flight(3.0)
+    (tmp_path / "plain.log").write_text(log.text())
+    (tmp_path / "marked.log").write_text(log.text(), encoding="utf-8-sig")
+    marked, plainly = (DataflashRecording(tmp_path / n) for n in ("marked.log", "plain.log"))
+    assert marked.counts == plainly.counts
+    assert [t for t, _ in marked.readings()] == [t for t, _ in plainly.readings()]
+
+
 def test_commas_inside_a_text_stay_in_it() -> None:
     log = Log([(MSG, (1, "Frame: QUAD, plus, sensors")), (MSG, (2, "ArduCopter V4.5.1"))])
     (said,) = read_text(log.text().encode(), "x.log").of("MSG")

@@ -29,7 +29,7 @@ from magmav.core.types import (
     TimeReading,
     VehicleReading,
 )
-from magmav.logs import LogError
+from magmav.logs import LogError, ulog_file
 from magmav.logs.ulog import UlogRecording
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings
@@ -438,6 +438,37 @@ def test_a_file_that_was_never_finished_is_read_as_far_as_it_goes(tmp_path, caps
     """Cards leave zeros or ones behind; the search through them must not take a step of 64 kB for each byte."""
     whole = survives(tmp_path / "w.ulg", small_log(), capsys)
     assert survives(tmp_path / "z.ulg", small_log() + 3_000_000 * filler, capsys) == whole
+
+
+def test_the_search_through_damage_ends_whatever_the_size_of_the_file(tmp_path, monkeypatch):
+    """Each step back may cost 64 kB read again; what is read again is bounded and not a multiple of the file."""
+    read = []
+
+    class Counting(ulog_file._Watched):
+        def read(self, size=-1, /):
+            data = super().read(size)
+            read.append(len(data))
+            return data
+
+    monkeypatch.setattr(ulog_file, "_Watched", Counting)
+    monkeypatch.setattr(ulog_file, "_MOST_AGAIN", 1 << 23)
+    for size in (1_000_000, 8_000_000):
+        read.clear()
+        path = tmp_path / f"{size}.ulg"
+        path.write_bytes(small_log() + size * b"\xff")
+        recording = UlogRecording(path)
+        assert recording.counts["gave up searching through damage"] == 1
+        assert recording.heard["sensor_mag"] == 30
+        # Once through in search of a sync mark, then what may be read again and one message more.
+        assert sum(read) - 1.1 * (size + len(small_log())) < (1 << 23) + (1 << 17)
+        assert len(read) < size / 200
+
+
+def test_what_never_happened_is_not_counted(written):
+    log = with_mag(Ulog())
+    log.row("vehicle_attitude_old", 6 * US, 0.1, 0.2, 0.3, (1.0, 0.0, 0.0, 0.0))
+    _, recording = written(log)
+    assert recording.counts == {}
 
 
 def small_log():

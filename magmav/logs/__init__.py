@@ -6,9 +6,12 @@ of a quantity it does not know gives no reading, as in mavlink.decode.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO, Protocol
 
 from magmav.core.types import Reading
 
@@ -18,6 +21,56 @@ Progress = Callable[[int, int], None]
 
 class LogError(Exception):
     """A recording that cannot be used; the text names the file, what is wrong with it, and what to do."""
+
+
+HEAD = 1 << 16
+"""So many bytes of a file's front are enough to tell what it is."""
+_FMT_RECORD = re.compile(rb"\xa3\x95\x80..[A-Za-z][A-Za-z0-9_]{0,3}\0*[A-Za-z]", re.DOTALL)
+_FMT_LINE = re.compile(rb"(?:\A(?:\xef\xbb\xbf)?|[\r\n])\s*FMT\s*,")
+_MAVLINK = (0xFD, 0xFE)
+_2000_US, _2100_US = 946_684_800_000_000, 4_102_444_800_000_000
+
+
+def kind_of(head: bytes) -> str | None:
+    """What a file is that begins so: "ulog", "dataflash" (binary), "text" (the same as lines), or None for neither.
+
+    head : the first HEAD bytes. A log whose first bytes are lost, or that has a greeting or a byte order mark before
+    its first line, is known by the first FMT further on. A .tlog is None, even where it carries a log in download.
+    """
+    if head.startswith(b"ULog"):
+        return "ulog"
+    if head.startswith(b"\xa3\x95"):
+        return "dataflash"
+    if len(head) > 8 and head[8] in _MAVLINK and _2000_US < int.from_bytes(head[:8], "big") < _2100_US:
+        return None
+    if _FMT_RECORD.search(head):
+        return "dataflash"
+    return "text" if _FMT_LINE.search(head) and b"\0" not in head.rstrip(b"\0") else None
+
+
+@contextmanager
+def open_log(path: Path, endings: str) -> Iterator[BinaryIO]:
+    """The open file. LogError naming path, cause and cure where it cannot be opened or read.
+
+    endings : what may be given instead of a directory, as ".bin or .log".
+    """
+    try:
+        if path.is_dir():
+            raise LogError(f"{path}: is a directory; give the {endings} file in it")
+        if path.exists() and not path.is_file():
+            raise LogError(f"{path}: is not a regular file; give a {endings} file")
+        file = path.open("rb")
+    except FileNotFoundError:
+        raise LogError(f"{path}: no such file; check the path") from None
+    except PermissionError:
+        raise LogError(f"{path}: permission denied; make the file readable for this user") from None
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path}: cannot be opened: {error}") from error
+    with file:
+        try:
+            yield file
+        except OSError as error:
+            raise LogError(f"{path}: cannot be read: {error}; copy it again") from error
 
 
 class Recording(Protocol):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from magmav.core.types import Reading
-from magmav.logs import LogError, Progress
+from magmav.logs import HEAD, LogError, Progress, kind_of, open_log
 from magmav.logs import dataflash_sensors as sensors
 from magmav.logs import dataflash_state as state
 from magmav.logs import dataflash_vehicle as vehicle
@@ -21,9 +21,8 @@ from magmav.logs.columns import Ints
 from magmav.logs.dataflash import SYNC, read_binary
 from magmav.logs.dataflash_clock import clock_of
 from magmav.logs.dataflash_series import Log, Stream
-from magmav.logs.dataflash_text import looks_like_text, read_text
+from magmav.logs.dataflash_text import read_text
 
-_FRONT = 1 << 16
 _EVERY = 4096
 _LATE = 3  # rank of what waits until a reboot has been noticed
 
@@ -123,22 +122,12 @@ def _in_order(streams: list[Stream]) -> tuple[Ints, ...]:
 
 def _open(path: Path, counts: Counter[str]) -> Log:
     """The file as a Log; LogError naming path, cause and cure."""
-    try:
-        if path.is_dir():
-            raise LogError(f"{path}: is a directory; give the .bin or .log file in it")
-        if path.exists() and not path.is_file():
-            raise LogError(f"{path}: is not a regular file; give a .bin or .log file")
-        data = np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such file; check the path") from None
-    except PermissionError:
-        raise LogError(f"{path}: permission denied; make the file readable for this user") from None
-    except (OSError, ValueError) as error:
-        raise LogError(f"{path}: cannot be opened: {error}") from error
+    with open_log(path, ".bin or .log") as file:
+        data = np.fromfile(file, dtype=np.uint8)
     if not len(data):
         raise LogError(f"{path}: is empty; the recording holds nothing, take another one")
-    head = data[:_FRONT].tobytes()
-    if looks_like_text(head):
+    head = data[:HEAD].tobytes()
+    if kind_of(head) == "text":
         tables = read_text(data.tobytes(), str(path))
     elif SYNC in head:
         tables = read_binary(data, str(path))

@@ -19,11 +19,6 @@ from magmav.logs.dataflash import with_units
 _FMT = define(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
 
 
-def looks_like_text(head: bytes) -> bool:
-    """Whether a file that begins so is a text log: FMT lines near its front."""
-    return b"FMT," in head and head.count(b"\0") == 0
-
-
 def read_text(data: bytes, where: str) -> Tables:
     """The log as tables; ``at`` is the number of the line.
 
@@ -31,7 +26,7 @@ def read_text(data: bytes, where: str) -> Tables:
     """
     counts: Counter[str] = Counter()
     lines: dict[str, list[int]] = {}
-    text = data.decode("utf-8", "replace").splitlines()
+    text = data.decode("utf-8-sig", "replace").splitlines()
     for number, line in enumerate(text):
         lines.setdefault(line[: line.find(",")], []).append(number)
     defined = _definitions([(n, text[n]) for n in lines.get("FMT", [])], counts)

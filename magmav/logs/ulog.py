@@ -248,7 +248,8 @@ class UlogRecording:
     def _usable(self, name: str, rows: NDArray[Any], most: float) -> NDArray[np.bool_]:
         """Rows of finite numbers no larger than ``most``; the others are counted."""
         good: NDArray[np.bool_] = np.isfinite(rows).all(axis=1) & (np.abs(np.nan_to_num(rows)) <= most).all(axis=1)
-        self.counts[f"{name}: not a number, or beyond belief"] += int((~good).sum())
+        if not good.all():
+            self.counts[f"{name}: not a number, or beyond belief"] += int((~good).sum())
         return good
 
 

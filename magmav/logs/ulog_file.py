@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from magmav.logs import LogError, Progress
+from magmav.logs import LogError, Progress, open_log
 
 _TELL_EVERY = 1 << 18
 _LONGEST = 1 << 16  # a message is no longer than this
 _MOST_FIELDS = 20_000  # of one message; PX4's largest has some hundreds
-_MOST_EFFORT = 24  # bytes read, per byte of the file: a search through damage goes back again and again
-_FREE_EFFORT = 1 << 26
+_STEP_BACK = 1 << 12  # a step back through damage costs as much time as reading so many bytes again
+_MOST_AGAIN = 1 << 32  # whatever the size of the file: some seconds
 _NEAR_US = 60_000_000  # from the middle one of three neighbours; a gap puts none of them further off
 _LOG_US = 7 * 86_400_000_000  # no log is longer than a week
 
@@ -34,30 +34,38 @@ _LOG_US = 7 * 86_400_000_000  # no log is longer than a week
 class _Watched(io.BufferedIOBase):
     """The open file, counting what is read of it.
 
-    It ends where only zeros follow (a card fills a file it never finished with them), and once more was read than any
-    sound file needs: pyulog searches byte by byte, up to 64 kB for each. ``gave_up`` says that it came to that.
+    It ends where only zeros follow (a card fills a file it never finished with them), and once too much was read again:
+    pyulog searches damage byte by byte, up to 64 kB for each; a sound file is read once. ``gave_up`` says that it came
+    to that.
     """
 
     def __init__(self, file: BinaryIO, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
         self._end = _end_of_data(file, size)
-        self._read_bytes = self._told = 0
+        self._read_bytes = self._told = self._farthest = self._again = 0
         self.gave_up = False
 
     def read(self, size: int | None = -1, /) -> bytes:
-        if self._read_bytes > _FREE_EFFORT + _MOST_EFFORT * self._size:
+        if self._again > _MOST_AGAIN:
             self.gave_up = True
             return b""
-        left = max(0, self._end - self._file.tell())
+        start = self._file.tell()
+        left = max(0, self._end - start)
         data = self._file.read(left if size is None or size < 0 else min(size, left))
-        self._read_bytes += len(data) + 3
+        stop = start + len(data)
+        self._again += max(0, min(stop, self._farthest) - start)
+        self._farthest = max(stop, self._farthest)
+        self._read_bytes += len(data)
         if self._progress is not None and self._read_bytes - self._told > _TELL_EVERY:
             self._told = self._read_bytes
             self._progress(self._file.tell(), self._size)
         return data
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
-        return self._file.seek(offset, whence)
+        before = self._file.tell()
+        after = self._file.seek(offset, whence)
+        self._again += _STEP_BACK if after < before else 0
+        return after
 
     def tell(self) -> int:
         return self._file.tell()
@@ -180,6 +188,7 @@ class UlogFile:
         self.counts["dropouts"] = len(dropouts)
         self.counts["dropouts: milliseconds lost"] = sum(int(d.duration) for d in dropouts)
         self.counts["damaged in places"] = int(bool(log.file_corruption))
+        self.counts = +self.counts
 
     def _add(self, data: Any) -> None:
         topic = Topic(data.name, data.multi_id, data.data, self.start_us)
@@ -189,7 +198,7 @@ class UlogFile:
             self.topics.setdefault(topic.name, []).append(topic)
 
     def _load(self, wanted: Collection[str], progress: Progress | None) -> Any:
-        with _open(self.path) as file:
+        with open_log(self.path, ".ulg") as file:
             size = os.fstat(file.fileno()).st_size
             watched = _Watched(file, size, progress)
             try:
@@ -228,18 +237,3 @@ def _numbers(parameters: dict[str, Any]) -> dict[str, float]:
         for name, value in parameters.items()
         if isinstance(value, int | float) and abs(value) < float("inf")
     }
-
-
-def _open(path: Path) -> BinaryIO:
-    try:
-        if path.is_dir():
-            raise LogError(f"{path}: is a directory; give the .ulg file in it")
-        if path.exists() and not path.is_file():
-            raise LogError(f"{path}: is not a regular file; give a .ulg file")
-        return path.open("rb")
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such file; check the path") from None
-    except PermissionError:
-        raise LogError(f"{path}: permission denied; make the file readable for this user") from None
-    except (OSError, ValueError) as error:
-        raise LogError(f"{path}: cannot be opened: {error}") from error
