@@ -182,6 +182,32 @@ def test_merging_two_halves_is_the_whole():
     assert got.readings == whole.readings
 
 
+@pytest.mark.parametrize("cut", [0, 100, 170, 300])
+def test_halves_that_forget_are_the_whole_that_forgets(cut):
+    """The first half has faded by as many readings as the second took; a merge forgets no more than that."""
+    rows = flown(2)
+    parts = [DipFitter(0.01, 0.98) for _ in range(3)]
+    for fitter, some in zip(parts, (rows[:cut], rows[cut:], rows), strict=True):
+        for row in some:
+            fitter.add(*row)
+    one, other, whole = parts
+    one.merge(other)
+    got, want = one.fit(), whole.fit()
+    assert isinstance(got, DipFit)
+    assert got.readings == pytest.approx(want.readings, rel=1e-12)
+    assert got.dip_rad == pytest.approx(want.dip_rad, abs=1e-12)
+    assert got.dip_sigma_rad == pytest.approx(want.dip_sigma_rad, rel=1e-9)
+    one.add(*rows[0])
+    whole.add(*rows[0])
+    assert one.fit().dip_rad == pytest.approx(whole.fit().dip_rad, abs=1e-12)
+
+
+@pytest.mark.parametrize("other", [DipFitter(0.01, 0.99), DipFitter(0.02, 0.98)], ids=["forget", "tilt sigma"])
+def test_what_was_fitted_otherwise_does_not_merge(other):
+    with pytest.raises(ValueError, match="forgetting and tilt sigma"):
+        DipFitter(0.01, 0.98).merge(other)
+
+
 def test_two_attitudes_merged_are_no_longer_one():
     """The scatter between the halves counts, and nothing merged into nothing is nothing."""
     one, other = fitted([ALWAYS] * 20), fitted([(*body(0.2, 0.1, 4.0)[:2], 0.2, 0.1, 4.0)] * 20)

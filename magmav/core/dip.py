@@ -115,6 +115,7 @@ class DipFitter:
         self._forget = forget
         self._tilt_noise = 2.0 * tilt_sigma_rad**2
         self._root = [[0.0] * 3 for _ in range(3)]
+        self._readings = 0
         self._weight = 0.0
         self._mean = np.zeros(4)  # of the four numbers that describe an attitude, and their scatter
         self._scatter = 0.0
@@ -125,20 +126,24 @@ class DipFitter:
         cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
         cy, sy = math.cos(magnetic_rad), math.sin(magnetic_rad)
         x_row, y_row = (cp * cy, -sp), (sr * sp * cy - cr * sy, sr * cp)
-        fade = math.sqrt(self._forget)
-        self._root = [[fade * value for value in row] for row in self._root]
+        self._fade(self._forget)
         _take(self._root, [*x_row, x_b_mg])
         _take(self._root, [*y_row, y_b_mg])
-        self._weight = self._forget * self._weight + 1.0
+        self._readings += 1
+        self._weight += 1.0
         attitude = np.array(x_row + y_row)
         away = attitude - self._mean
         self._mean = self._mean + away / self._weight
-        self._scatter = self._forget * self._scatter + float(away @ (attitude - self._mean))
+        self._scatter += float(away @ (attitude - self._mean))
 
     def merge(self, other: DipFitter) -> None:
-        """Take all that another has seen."""
+        """Take all that another has seen after this one. ValueError unless both forget and doubt alike."""
+        if (self._forget, self._tilt_noise) != (other._forget, other._tilt_noise):
+            raise ValueError("dip: forgetting and tilt sigma of the two halves must agree")
         if other._weight == 0.0:
             return
+        self._fade(self._forget**other._readings)
+        self._readings += other._readings
         weight = self._weight + other._weight
         away = other._mean - self._mean
         for row in other._root:
@@ -146,6 +151,12 @@ class DipFitter:
         self._scatter += other._scatter + float(away @ away) * self._weight * other._weight / weight
         self._mean = self._mean + away * other._weight / weight
         self._weight = weight
+
+    def _fade(self, share: float) -> None:
+        root = math.sqrt(share)
+        self._root = [[root * value for value in row] for row in self._root]
+        self._weight *= share
+        self._scatter *= share
 
     def fit(self) -> DipFit | Refused:
         """The answer so far, or why there is none. Changes nothing."""
