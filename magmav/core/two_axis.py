@@ -108,7 +108,13 @@ def heading_slopes(
     level = level_two_axes(x_b_mg, y_b_mg, roll_rad, pitch_rad, down)
     if level is None or math.hypot(*level) < 1e-9:
         return None
+    return _slopes(level, roll_rad, pitch_rad, radius_mg, dip_rad)
+
+
+def _slopes(level: tuple[float, float], roll_rad: float, pitch_rad: float, radius_mg: float, dip_rad: float) -> Slopes:
+    """The derivatives where the levelled field is known already."""
     hx, hy = level
+    down = radius_mg * math.tan(dip_rad)
     cr, cp, sp = math.cos(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
     tr, tp = math.tan(roll_rad), math.tan(pitch_rad)
     square = hx * hx + hy * hy
@@ -141,8 +147,10 @@ def two_axis_sigma(
     Linearised: good while the answer is well under a radian.
     """
     slopes = heading_slopes(x_b_mg, y_b_mg, roll_rad, pitch_rad, radius_mg, dip_rad)
-    if slopes is None:
-        return None
+    return None if slopes is None else _sigma(slopes, doubts)
+
+
+def _sigma(slopes: Slopes, doubts: Doubts) -> float:
     field = np.array([slopes.x, slopes.y])
     return min(
         math.pi,
@@ -177,11 +185,10 @@ def heading_of_two_axes(
     declination_rad: float | None,
 ) -> Heading:
     """The heading as it is published, with its sigma: not valid where refused or where the field is too weak."""
-    down = down_from_dip(radius_mg, dip_rad)
-    level = level_two_axes(x_b_mg, y_b_mg, roll_rad, pitch_rad, down)
-    sigma = two_axis_sigma(x_b_mg, y_b_mg, roll_rad, pitch_rad, radius_mg, dip_rad, doubts)
-    if level is None or sigma is None or math.hypot(*level) < _WEAKEST_MG:
+    level = level_two_axes(x_b_mg, y_b_mg, roll_rad, pitch_rad, down_from_dip(radius_mg, dip_rad))
+    if level is None or math.hypot(*level) < _WEAKEST_MG:
         return UNKNOWN
+    sigma = _sigma(_slopes(level, roll_rad, pitch_rad, radius_mg, dip_rad), doubts)
     magnetic = wrap_tau(math.atan2(-level[1], level[0]))
     if declination_rad is None:
         return Heading(True, False, magnetic, 0.0, sigma)
