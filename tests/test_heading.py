@@ -1,19 +1,18 @@
 """Heading and its sigma: the seed papers' numbers, and what many noisy fields really do."""
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from seed_vectors import load
 from synthetic_flight import turn
 
 from magmav.core.heading import heading, heading_sigma, magnetic_heading
 from magmav.core.types import vec3
 
-SEED = json.loads((Path(__file__).parent / "authorities" / "seed_vectors.json").read_text())
+SEED = load()
 
 
 @pytest.mark.parametrize("case", SEED["tilt"], ids=lambda c: f"{c['roll']}/{c['pitch']}/{c['psi']}")

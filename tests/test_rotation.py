@@ -1,13 +1,12 @@
 """Rotations against quaternion algebra, finite differences and the seed papers' numbers."""
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from seed_vectors import load
 
 from magmav.core.rotation import (
     body_from_earth,
@@ -20,7 +19,7 @@ from magmav.core.rotation import (
     wrap_tau,
 )
 
-SEED = json.loads((Path(__file__).parent / "authorities" / "seed_vectors.json").read_text())
+SEED = load()
 ANGLE = st.floats(-math.pi, math.pi)
 STEEP = st.floats(-1.5, 1.5)
 
