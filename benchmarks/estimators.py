@@ -3,8 +3,9 @@
     make estimators        or        estimators.py [--seeds A:B] [--scenarios LIST] [--estimators LIST] ...
 
 Every estimator of the project gets the same Samples, made by magmav's own pipeline from what an autopilot would send,
-with all its errors; estimator_bench says which. Beside them stand methods of other people (--peers) and the posterior
-Cramer-Rao bound of each flight. Tables go to standard output or --markdown, every single run to --json.
+with all its errors; estimator_bench says which. Beside them stand methods of other people (--peers; some in virtual
+environments of their own, made on demand under a cache directory) and the posterior Cramer-Rao bound of each flight.
+Tables go to standard output or --markdown, every single run to --json.
 
 Seeds 0 to 999 are for tuning, 1000 and up for judging. Same arguments, same figures (but the microseconds).
 """
@@ -17,14 +18,17 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from estimator_bench.bound import Bound, bound
+from estimator_bench.peer_runs import NAMES, OWN, Ready, filter_headings, peer_scores, ready
+from estimator_bench.pins import Pin, pin_table, pins
 from estimator_bench.running import run, tape
 from estimator_bench.scenarios import SCENARIOS, chosen
-from estimator_bench.score import Scored, score
+from estimator_bench.score import Scored, nearest, score
 from estimator_bench.tables import Results
 from estimator_bench.telemetry import fly
 from rich.console import Console
@@ -42,23 +46,33 @@ class Task:
     seed: int
     estimators: tuple[str, ...]
     bound: bool
+    peers: Ready
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What became of it."""
+    """What became of it. headings: attitude filter -> which calibration it was given -> RMS error, degrees."""
 
     task: Task
     scored: list[Scored]
     bound: Bound | None
+    headings: dict[str, dict[str, float]]
 
 
 def judged(task: Task) -> Judged:
     """Fly, and run every method over it."""
     flight = fly(SCENARIOS[task.scenario], task.seed)
     heard = tape(flight)
-    scored = [score(flight, heard, run(name, heard)) for name in task.estimators]
-    return Judged(task, scored, bound(flight) if task.bound else None)
+    runs = [run(name, heard) for name in task.estimators]
+    scored = [score(flight, heard, one) for one in runs]
+    scored += peer_scores(flight, heard, task.peers)
+    irons = {"none": np.zeros(3)}
+    for one in runs[:1]:
+        tick = nearest(one.ticks, 60.0)
+        irons[f"{one.name} @60"] = -np.array(tick.offsets_mg)
+    irons["the truth"] = flight.iron_at(120.0)
+    headings = filter_headings(flight, irons, task.peers)
+    return Judged(task, scored, bound(flight) if task.bound else None, headings)
 
 
 def seeds(text: str) -> range:
@@ -79,12 +93,22 @@ def names(text: str) -> tuple[str, ...]:
     return out
 
 
+def peer_names(text: str) -> tuple[str, ...]:
+    """Peers by name; own: those that need no environment. ValueError naming one that does not exist."""
+    groups = {"all": NAMES, "own": OWN, "none": ()}
+    out = [n for part in text.split(",") for n in groups.get(part, (part,))]
+    for name in out:
+        if name not in NAMES:
+            raise ValueError(f"no peer called {name!r}; choose all, own, none or some of {', '.join(NAMES)}")
+    return tuple(dict.fromkeys(out))
+
+
 def measured(tasks: Sequence[Task], jobs: int, console: Console) -> list[Judged]:
     """All tasks, in the order given, whoever finishes first."""
-    done: dict[Task, Judged] = {}
+    done: dict[tuple[str, int], Judged] = {}
 
     def keep(one: Judged) -> None:
-        done[one.task] = one
+        done[one.task.scenario, one.task.seed] = one
         console.print(f"{len(done)} of {len(tasks)}: {one.task.scenario}, seed {one.task.seed}")
 
     if jobs == 1:
@@ -94,7 +118,7 @@ def measured(tasks: Sequence[Task], jobs: int, console: Console) -> list[Judged]
         with ProcessPoolExecutor(jobs) as pool:
             for future in as_completed([pool.submit(judged, task) for task in tasks]):
                 keep(future.result())
-    return [done[task] for task in tasks]
+    return [done[task.scenario, task.seed] for task in tasks]
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -102,6 +126,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     p.add_argument("--seeds", type=seeds, default=seeds("6"), help="A:B, or how many of the judging seeds (default 6)")
     p.add_argument("--scenarios", type=chosen, default=chosen("all"), help="names, or all, reference, new")
     p.add_argument("--estimators", type=names, default=names("all"), help="names, or all")
+    p.add_argument("--peers", type=peer_names, default=peer_names("all"), help="names, or all, own, none")
     p.add_argument("--no-bound", action="store_true", help="leave the Cramer-Rao bound out (2 s a flight)")
     p.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     p.add_argument("--markdown", type=Path, help="write the tables here instead of to standard output")
@@ -113,14 +138,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print."""
     a = _arguments(argv)
     console = Console(stderr=True, highlight=False)
-    tasks = [Task(s.name, seed, a.estimators, not a.no_bound) for s in a.scenarios for seed in a.seeds]
+    able = ready(a.peers, console.print)
+    tasks = [Task(s.name, seed, a.estimators, not a.no_bound, able) for s in a.scenarios for seed in a.seeds]
     got = measured(tasks, max(a.jobs, 1), console)
     bounds = {(j.task.scenario, j.task.seed): j.bound for j in got if j.bound is not None}
-    results = Results([s for j in got for s in j.scored], bounds)
+    headings = {(j.task.scenario, j.task.seed): j.headings for j in got if j.headings}
+    results = Results([s for j in got for s in j.scored], bounds, headings)
     facts: dict[str, Any] = {"seeds": [a.seeds.start, a.seeds.stop], "judging": a.seeds.start >= JUDGING}
+    facts["pins"] = [asdict(pin) for pin in pins(able.pythons.get("magyc"))] if set(able.names) & set(OWN) else []
+    facts["missing"] = list(able.missing)
     kind = "judging" if facts["judging"] else "TUNING"
-    note = f"{len(a.seeds)} {kind} seeds ({a.seeds.start} to {a.seeds.stop - 1}), {len(a.scenarios)} scenarios, 180 s."
-    text = results.markdown([note], lambda name: name in ESTIMATORS)
+    notes = [
+        f"{len(a.seeds)} {kind} seeds ({a.seeds.start} to {a.seeds.stop - 1}), {len(a.scenarios)} scenarios, 180 s."
+    ]
+    notes += [f"Left out: {why}." for why in able.missing]
+    text = results.markdown(notes, lambda name: name in ESTIMATORS)
+    if facts["pins"]:
+        text += "\n" + pin_table([Pin(**pin) for pin in facts["pins"]])
     if a.markdown is None:
         print(text)
     else:

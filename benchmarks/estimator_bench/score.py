@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, replace
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -166,6 +166,51 @@ def score(flight: Flight, heard: list[Heard], run: Run) -> Scored:
         ready_beyond=sum(m.full_deg > 3.0 * m.heading_sigma_deg for m in ready),
         us_per_sample=run.us_per_sample,
         us_first_20s=run.us_first_20s,
+    )
+
+
+class Answer(NamedTuple):
+    """What a method without a covariance says: corrected = matrix @ (sensor - hard iron)."""
+
+    hard_iron_mg: Array
+    matrix: Array
+
+
+def score_answers(flight: Flight, name: str, answers: list[tuple[float, Answer | None]]) -> Scored:
+    """A method that was asked at some times, CHECKPOINTS_S among them; it claims nothing and is never ready."""
+    nobody = (math.nan,) * 3
+    moments = []
+    for t_s, a in answers:
+        if a is None:
+            moments.append(Moment(t_s, NOTHING_DEG, NOTHING_DEG, nobody, nobody, math.nan, False, False))
+            continue
+        raw = sensed(flight, t_s)
+        x, y, z = (a.hard_iron_mg - flight.iron_at(t_s)).tolist()
+        full = heading_rms_deg((raw - a.hard_iron_mg) @ a.matrix.T)
+        moments.append(
+            Moment(t_s, full, heading_rms_deg(raw - a.hard_iron_mg), (x, y, z), nobody, math.nan, False, True)
+        )
+    at = [nearest(moments, t) for t in CHECKPOINTS_S]
+    step, often = flight.scenario.compass.step_mg > 0.0, len(answers) > len(CHECKPOINTS_S)
+    before = [m for m in moments if m.t_s < STEP_AT_S] if step else moments
+    after = [m for m in moments if m.t_s >= STEP_AT_S]
+    return Scored(
+        name=name,
+        scenario=flight.scenario.name,
+        seed=flight.seed,
+        full_deg=tuple(m.full_deg for m in at),
+        offsets_deg=tuple(m.offsets_deg for m in at),
+        iron_mg=tuple(m.iron_mg for m in at),
+        nees=(),
+        ratios=(),
+        to_one_degree_s=settled(before) if often else math.nan,
+        again_s=settled(after) - STEP_AT_S if step and often else None,
+        ready_s=NEVER,
+        ready_seconds=0,
+        ready_wrong=0,
+        ready_beyond=0,
+        us_per_sample=math.nan,
+        us_first_20s=math.nan,
     )
 
 

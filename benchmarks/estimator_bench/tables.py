@@ -13,6 +13,7 @@ from estimator_bench.score import CHECKPOINTS_S, Scored, Summary, as_dict, plain
 
 BOUND = "bound"
 Cell = float | None
+Headings = dict[tuple[str, int], dict[str, dict[str, float]]]  # filter -> calibration -> degrees RMS
 _HONESTY = (
     "b_xy mG", "b_z mG", "efficiency @178", "NEES", "error/sigma", "to 1 deg s", "again s", "ready s", "ready < 60 s",
     "ready & > 3 deg", "ready & > 3 sigma", "us", "us < 20 s",
@@ -34,11 +35,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 class Results:
-    """Everything measured. bounds: (scenario, seed) -> Bound, or nothing where they were not wanted."""
+    """Everything measured. bounds and headings: by (scenario, seed), or nothing where they were not wanted."""
 
-    def __init__(self, scored: Sequence[Scored], bounds: dict[tuple[str, int], Bound]) -> None:
+    def __init__(
+        self, scored: Sequence[Scored], bounds: dict[tuple[str, int], Bound], headings: Headings | None = None
+    ) -> None:
         self.scored = list(scored)
         self.bounds = bounds
+        self.headings = headings or {}
         self.scenarios = list(dict.fromkeys(s.scenario for s in scored))
         self.names = list(dict.fromkeys(s.name for s in scored))
         self.summaries: dict[tuple[str, str], Summary] = {}
@@ -125,6 +129,17 @@ class Results:
             )  # fmt: skip
         return table(head, rows)
 
+    def filters(self) -> str:
+        """Attitude filters with several calibrations, scenario by scenario; RMS over seeds."""
+        keys = list(dict.fromkeys((f, c) for h in self.headings.values() for f, cs in h.items() for c in cs))
+        rows = []
+        for s in self.scenarios:
+            some = [h for (scenario, _), h in self.headings.items() if scenario == s]
+            if some:
+                values = [[h[f][c] for h in some if isinstance(h[f].get(c), float)] for f, c in keys]
+                rows.append([s, *(number(rms(v) if v else None) for v in values)])
+        return table(["scenario", *(f"{f}, {c}" for f, c in keys)], rows)
+
     def markdown(self, notes: Sequence[str], details: Callable[[str], bool]) -> str:
         """The whole page. details: of which methods the scenario-by-scenario table is wanted."""
         parts = [*notes, "## All scenarios together\n\n" + self.overall()]
@@ -134,6 +149,10 @@ class Results:
         if soft:
             text = "## The same after 178 s for what an upload of offsets alone gives\n\n"
             parts.append(text + self.heading(len(CHECKPOINTS_S) - 1, offsets_only=True))
+        if self.headings:
+            parts.append(
+                "## Headings of attitude filters after 60 s, by the iron taken away first\n\n" + self.filters()
+            )
         parts += [f"## {name}\n\n" + self.honesty(name) for name in self.names if details(name)]
         return "\n\n".join(parts) + "\n"
 
@@ -143,9 +162,11 @@ class Results:
             {"scenario": s, "seed": seed, "heading_deg": list(b.heading_deg), "iron_mg": [list(v) for v in b.iron_mg]}
             for (s, seed), b in self.bounds.items()
         ]
+        filters = [{"scenario": s, "seed": seed, "heading_rms_deg": h} for (s, seed), h in self.headings.items()]
         return plain(
             {
                 **facts,
+                "attitude_filters": filters,
                 "checkpoints_s": list(CHECKPOINTS_S),
                 "summaries": [as_dict(s) for s in self.summaries.values()],
                 "runs": [as_dict(s) for s in self.scored],
