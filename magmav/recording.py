@@ -16,7 +16,7 @@ from magmav.appraisal import CompassLog, describe
 from magmav.core.types import AttitudeReading, FieldModel, Reading, Record
 from magmav.hearing import LinkRecording
 from magmav.link.tlog import TlogLink
-from magmav.logs import LogError, Progress, Recording
+from magmav.logs import HEAD, LogError, Progress, Recording, kind_of
 from magmav.pipeline import Pipeline
 from magmav.reference import Reference
 from magmav.service import Watcher, all_counts, hand_on
@@ -32,12 +32,12 @@ def open_recording(path: str | Path, progress: Progress | None = None) -> Record
     LinkError or LogError naming the file, what is wrong with it, and what to do.
     """
     path = Path(path)
-    front = _front(path)
-    if front.startswith(b"ULog"):
+    kind = kind_of(_front(path))
+    if kind == "ulog":
         from magmav.logs.ulog import UlogRecording
 
         return UlogRecording(path, progress)
-    if front.startswith((b"\xa3\x95", b"FMT,")):
+    if kind is not None:
         from magmav.logs.dataflash_readings import DataflashRecording
 
         return DataflashRecording(path, progress)
@@ -47,10 +47,12 @@ def open_recording(path: str | Path, progress: Progress | None = None) -> Record
 def _front(path: Path) -> bytes:
     """The file's first bytes, or none where TlogLink will say better what is wrong."""
     try:
+        if path.is_dir():
+            raise LogError(f"{path}: is a directory; give the .tlog, .bin, .log or .ulg file in it")
         if not path.is_file():
             return b""
         with path.open("rb") as file:
-            return file.read(4)
+            return file.read(HEAD)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -9,6 +9,7 @@ from flight_rig import IRON_MG, Flight, staying
 from magmav.core.types import Record
 from magmav.geomag import world_magnetic_model
 from magmav.link.recorder import TlogRecorder
+from magmav.logs import LogError
 from magmav.recording import NothingToLearnFrom, open_recording, replay
 from magmav.settings import Settings
 
@@ -141,3 +142,30 @@ def test_what_flies_but_never_took_off_learns_nothing(recorded):
     (compass,) = result["vehicles"][0]["compasses"]
     assert compass["offsets_mg"] is None and compass["sigma_mg"] is None
     assert "NOT_FLYING" in {r["code"] for r in compass["reasons"]}
+
+
+def a_text_log():
+    """The least a text log may hold."""
+    return b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nFMT, 130, 45, PARM, QNf, TimeUS,Name,Value\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "front"),
+    [
+        ("plain.txt", b""),
+        ("named.tlog", b""),
+        ("greeting.log", b"Mission log of 12 March\r\n"),
+        ("marked.log", b"\xef\xbb\xbf"),
+    ],
+)
+def test_a_log_is_known_by_its_content_whatever_it_is_called(tmp_path, name, front):
+    path = tmp_path / name
+    path.write_bytes(front + a_text_log())
+    recording = open_recording(path)
+    assert type(recording).__name__ == "DataflashRecording"
+    recording.close()
+
+
+def test_a_directory_is_refused_with_every_kind_of_file_it_may_hold(tmp_path):
+    with pytest.raises(LogError, match=r"\.tlog, \.bin, \.log or \.ulg"):
+        open_recording(tmp_path)
