@@ -84,11 +84,19 @@ def body_rates(C_bn: Array, step_s: float) -> Array:
 def followed(values: Array, tau_s: float, step_s: float = STEP_S) -> Array:
     """First-order low-pass of (N, k) along time, begun at the mean of its first 10 s."""
     keep = float(np.exp(-step_s / tau_s))
-    now = values[: int(10.0 / step_s)].mean(axis=0)
-    out = np.empty_like(values)
-    for i, value in enumerate(values):
-        now = keep * now + (1.0 - keep) * value
-        out[i] = now
+    begun = values[: int(10.0 / step_s)].mean(axis=0)
+    return recursive(keep, (1.0 - keep) * values, begun)
+
+
+def recursive(keep: float, pushes: Array, begun: Array) -> Array:
+    """x_i = keep x_(i-1) + pushes_i for each column of (N, k), from begun (k,)."""
+    out = np.empty_like(pushes)
+    for k in range(pushes.shape[1]):
+        now, column = float(begun[k]), []
+        for push in pushes[:, k].tolist():
+            now = keep * now + push
+            column.append(now)
+        out[:, k] = column
     return out
 
 

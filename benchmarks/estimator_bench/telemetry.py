@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator_bench.flights import STEP_S, Truth, followed, rotations, true_flight
+from estimator_bench.flights import STEP_S, Truth, followed, recursive, rotations, true_flight
 from estimator_bench.motions import GRAVITY_MSS, Array
 from estimator_bench.scenarios import STEP_AT_S, Scenario
 from magmav.core.types import (
@@ -232,11 +232,8 @@ def _tilt_error(truth: Truth, r: np.random.Generator) -> Array:
     n = len(truth.t_s)
     keep = math.exp(-STEP_S / TILT_TAU_S)
     kicks = r.normal(0.0, TILT_SIGMA_RAD * math.sqrt(1.0 - keep * keep), (n, 2))
-    now = r.normal(0.0, TILT_SIGMA_RAD, 2)
     out = np.zeros((n, 3))
-    for i in range(n):
-        now = keep * now + kicks[i]
-        out[i, :2] = now
+    out[:, :2] = recursive(keep, kicks, r.normal(0.0, TILT_SIGMA_RAD, 2))
     misled = r.normal(0.0, MISLED_RAD_PER_G) / GRAVITY_MSS
     felt = followed(truth.accel_n_mss[:, :2], MISLED_TAU_S)
     out[:, 0] -= misled * felt[:, 1]

@@ -108,6 +108,10 @@ def conic_fit(m: Moments, least: int, independent: float = 1.0) -> Fit | Refusal
     n = len(forms)
     if float(np.linalg.eigvalsh(covariance[:n, :n])[-1]) > _SHAPE**2:
         return Refusal.ARC_TOO_SHORT
+    import os
+    L=np.linalg.cholesky(correlation); N_=_N(forms,spread,size)/np.outer(unit,unit)*noise2
+    global SHARE
+    SHARE=float(np.linalg.eigvalsh(np.linalg.solve(L,np.linalg.solve(L,N_).T))[-1])
     rounded = np.linalg.eigvalsh(matrix @ spread @ matrix)
     roundness = float(rounded[0] / rounded[-1])
     if roundness < (WEAK_ARC if d == 2 else SHORT_ARC):
@@ -126,6 +130,15 @@ def conic_fit(m: Moments, least: int, independent: float = 1.0) -> Fit | Refusal
         weak=roundness < (_THREE_QUARTERS if d == 2 else WEAK_ARC),
         samples=m.samples,
     )
+
+
+SHARE=0.0
+def _N(forms,spread,size):
+    n=len(forms)
+    N = np.zeros((size, size))
+    N[:n, :n] = 4.0 * np.einsum("aij,jk,bki->ab", forms, spread, forms)
+    N[n:, n:] = 4.0 * np.eye(size - n)
+    return N
 
 
 def _covariance(correlation: Array, unit: Array, misfit2: float, effective: float) -> Array:

@@ -24,6 +24,8 @@ class Refusal(Enum):
     NO_ROTATION = "points scatter about no circle: not turned, or disturbed, or tilted too far to level first"
     COLLINEAR = "all points lie on one line"
     ARC_TOO_SHORT = "too short an arc, or too thin a band of tilts: turn the vehicle further, and bank it"
+    FEW_HEADINGS = "points from too few headings: they say nothing of how good they are; turn the vehicle all the way round"
+    EXTREMES = "the extremes do not belong to the figure of all points: never met (turn all the way round), or a spike"
     NOT_AN_ELLIPSE = "no ellipse fits: not turned all the way round, or disturbed, or tilted too far to level first"
 
 
