@@ -19,6 +19,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print."""
     a = _arguments(argv)
     console = Console(stderr=True, highlight=False)
-    able = ready(a.peers, console.print)
+    able = ready(a.peers, partial(console.print, soft_wrap=True))
     tasks = [Task(s.name, seed, a.estimators, not a.no_bound, able) for s in a.scenarios for seed in a.seeds]
     got = measured(tasks, max(a.jobs, 1), console)
     bounds = {(j.task.scenario, j.task.seed): j.bound for j in got if j.bound is not None}

@@ -169,6 +169,21 @@ def test_tables_and_document_hold_what_was_measured(judged):
     assert document["summaries"][0]["full_deg"] == pytest.approx(list(judged.full_deg))
 
 
+def test_a_rival_is_beaten_only_where_the_whole_interval_says_so(judged):
+    """A peer always twice as far off is beaten, one that is as good in the mean is not."""
+    twice, mixed, ours = [], [], []
+    for seed in range(20):
+        one = 0.2 + 0.01 * seed
+        ours.append(dataclasses.replace(judged, seed=seed, full_deg=(one,) * 3))
+        silent = dataclasses.replace(judged, seed=seed, ratios=(), ready_seconds=0)
+        twice.append(dataclasses.replace(silent, name="twice", full_deg=(2.0 * one,) * 3))
+        share = math.sqrt(1.6 if seed % 2 else 0.4)  # the same in the mean square
+        mixed.append(dataclasses.replace(silent, name="mixed", full_deg=(one * share,) * 3))
+    row = Results([*ours, *twice, *mixed], {}).versus("kalman", 2).splitlines()[-1]
+    assert "0.50 (0.50-0.50) <" in row
+    assert row.count("<") == 1 and ">" not in row
+
+
 def test_the_command_says_the_same_twice_and_refuses_by_name(tmp_path, capsys):
     file = tmp_path / "runs.json"
     arguments = "--seeds 7:8 --scenarios slow2 --estimators taubin --peers twostep --jobs 1 --no-bound"

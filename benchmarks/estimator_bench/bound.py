@@ -12,7 +12,8 @@ delay of the compass (1, s: nobody is told of it), and where the scenario has th
     sensor = (I + S) C_bn B + b + k throttle + noise
 The attitude is known but for yaw and tilt; yaw is carried by a gyro with a bias. Where no attitude is sent, the tilt
 is taken to be as good as the autopilot's would be, so the bound stays a bound. Outliers and lost values bring nothing;
-neither does the time on or near the ground. The moment of a step is taken as known.
+neither does the time on or near the ground. The moment of a step, and that drift is steady, are taken as known: nobody
+knows that in flight, so in those two scenarios nobody comes near.
 """
 
 from __future__ import annotations

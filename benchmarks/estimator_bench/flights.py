@@ -133,7 +133,7 @@ def _thrown(C_bn: Array) -> Array:
 def true_flight(motion: Motion, kind: int, seed: int, start: Start = "aloft", seconds: float = FLIGHT_S) -> Truth:
     """Fly a motion. The same seed flies the same way."""
     r = np.random.default_rng([seed, 101])
-    t_s = np.arange(int(seconds * TRUTH_HZ) + 1) * STEP_S
+    t_s: Array = np.arange(0.0, int(seconds * TRUTH_HZ) + 1) * STEP_S
     tau, moving, height, takeoff_s = _own_time(t_s, start)
     path = motion(tau, r)
     C_bn = rotations(path.roll_rad * moving, path.pitch_rad * moving, path.yaw_rad)

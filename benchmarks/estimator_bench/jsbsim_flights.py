@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from magmav_sim import Simulation, parse_scenario
 
 from estimator_bench.flights import FLIGHT_S, STEP_S, TRUTH_HZ, Truth, rotations, truth_of
-from estimator_bench.motions import GRAVITY_MSS, PLANE, QUAD
+from estimator_bench.motions import GRAVITY_MSS, PLANE, QUAD, Array
 
 _FRAME_S = 0.01
 _GROUND_S = 3.0  # kept of the time before take-off
@@ -52,7 +54,7 @@ def jsbsim_flight(name: str, seed: int) -> Truth:
     text = _HEAD.format(seed=seed, airframe=airframe, heading=float(seed * 37 % 360))
     text += ",\n".join((*legs, '{ kind = "land", sink_mps = 2.0 }')) + "\n]\n"
     simulation = Simulation(parse_scenario(text.encode(), f"{name}.toml"))
-    states = []
+    states: list[Any] = []
     began: float | None = None
     while not simulation.finished and len(states) < round((FLIGHT_S + 30.0) / _FRAME_S):
         simulation.advance(_FRAME_S)
@@ -60,7 +62,7 @@ def jsbsim_flight(name: str, seed: int) -> Truth:
         if began is None and state.height_m > 0.1:
             began = len(states) * _FRAME_S
         states.append(state)
-    t_s = np.arange(int(FLIGHT_S * TRUTH_HZ) + 1) * STEP_S
+    t_s: Array = np.arange(0.0, int(FLIGHT_S * TRUTH_HZ) + 1) * STEP_S
     first_s = max((began or 0.0) - _GROUND_S, 0.0)
     at_s = np.arange(len(states)) * _FRAME_S - first_s
     if at_s[-1] < FLIGHT_S:
@@ -68,8 +70,8 @@ def jsbsim_flight(name: str, seed: int) -> Truth:
     table = np.array(states)
     table[:, 2] = np.unwrap(table[:, 2])
 
-    def column(i: int) -> np.ndarray:
-        return np.interp(t_s, at_s, table[:, i])
+    def column(i: int) -> Array:
+        return np.asarray(np.interp(t_s, at_s, table[:, i]))
 
     C_bn = rotations(column(0), column(1), column(2))
     force_b = np.stack([column(i) for i in (6, 7, 8)], 1)

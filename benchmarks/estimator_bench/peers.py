@@ -39,7 +39,8 @@ class Columns(NamedTuple):
     def between(self, from_s: float, to_s: float) -> Columns:
         """Those of from_s < t <= to_s."""
         some = (self.t_s > from_s) & (self.t_s <= to_s)
-        return Columns(*(v[some] for v in self[:5]), self.field_mg)
+        t_s, mag, rate, roll, pitch = (v[some] for v in self[:5])
+        return Columns(t_s, mag, rate, roll, pitch, self.field_mg)
 
 
 def columns(heard: list[Heard]) -> Columns:

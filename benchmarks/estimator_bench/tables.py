@@ -11,7 +11,8 @@ import numpy as np
 from estimator_bench.bound import Bound
 from estimator_bench.score import CHECKPOINTS_S, Scored, Summary, as_dict, plain, rms, summed
 
-BOUND = "bound"
+BOUND, RIVAL = "bound", "twostep_win"
+_RESAMPLED = 2000
 Cell = float | None
 Headings = dict[tuple[str, int], dict[str, dict[str, float]]]  # filter -> calibration -> degrees RMS
 _HONESTY = (
@@ -106,16 +107,19 @@ class Results:
 
     def overall(self) -> str:
         """One line a method."""
-        middle = [f"median @{t:.0f}" for t in CHECKPOINTS_S]
-        head = ["method", *middle, *(f"/ bound @{t:.0f}" for t in CHECKPOINTS_S), *_OVERALL]
+        times = [f"{t:.0f}" for t in CHECKPOINTS_S]
+        rivals = [n for n in (BOUND, RIVAL) if n in self.columns()]
+        head = ["method", *(f"median @{t}" for t in times), *(f"/ {n} @{t}" for n in rivals for t in times), *_OVERALL]
         rows = []
         count = range(len(CHECKPOINTS_S))
         for name in self.names:
             some = [self.summaries[s, name] for s in self.scenarios if (s, name) in self.summaries]
             here = [s.scenario for s in some]
             middles = [_fold(np.median, [s.full_deg[i] for s in some]) for i in count]
-            limits = [_fold(np.median, [self.bound_deg(s, i) for s in here]) for i in count]
-            shares = [m / b if m is not None and b else None for m, b in zip(middles, limits, strict=True)]
+            others = [_fold(np.median, [self.error(s, n, i) for s in here]) for n in rivals for i in count]
+            shares = [
+                m / b if m is not None and b else None for m, b in zip(middles * len(rivals), others, strict=True)
+            ]
             runs = [s for s in self.scored if s.name == name]
             seconds = sum(s.ready_seconds for s in runs)
             judged = seconds > 0
@@ -128,6 +132,24 @@ class Results:
                  number(float(np.mean([s.us_per_sample for s in runs])), 0)]
             )  # fmt: skip
         return table(head, rows)
+
+    def versus(self, name: str, i: int) -> str:
+        """One method's heading error as a share of each rival's at a checkpoint: RMS over the same seeds, with the 95 %
+        interval of a seeded bootstrap over seeds. ``<`` marks where all of it lies under 1, ``>`` over."""
+        rivals = [n for n in self.names if n != name and not self.judged(n)]
+        rows = []
+        for s in self.scenarios:
+            ours = {r.seed: r.full_deg[i] for r in self.scored if (r.scenario, r.name) == (s, name)}
+            cells = []
+            for rival in rivals:
+                theirs = {r.seed: r.full_deg[i] for r in self.scored if (r.scenario, r.name) == (s, rival)}
+                cells.append(_ratio([(ours[k], theirs[k]) for k in ours if k in theirs]))
+            rows.append([s, *cells])
+        return table(["scenario", *rivals], rows)
+
+    def judged(self, name: str) -> bool:
+        """Is this one of the project's own, which claim a sigma?"""
+        return any(r.ratios or r.ready_seconds for r in self.scored if r.name == name)
 
     def filters(self) -> str:
         """Attitude filters with several calibrations, scenario by scenario; RMS over seeds."""
@@ -153,6 +175,9 @@ class Results:
             parts.append(
                 "## Headings of attitude filters after 60 s, by the iron taken away first\n\n" + self.filters()
             )
+        if self.scored and self.judged(self.names[0]) and not all(map(self.judged, self.names)):
+            text = f"## {self.names[0]} against each peer after {CHECKPOINTS_S[-1]:.0f} s, share of its error\n\n"
+            parts.append(text + self.versus(self.names[0], len(CHECKPOINTS_S) - 1))
         parts += [f"## {name}\n\n" + self.honesty(name) for name in self.names if details(name)]
         return "\n\n".join(parts) + "\n"
 
@@ -163,16 +188,33 @@ class Results:
             for (s, seed), b in self.bounds.items()
         ]
         filters = [{"scenario": s, "seed": seed, "heading_rms_deg": h} for (s, seed), h in self.headings.items()]
-        return plain(
+        summaries, runs = map(as_dict, self.summaries.values()), map(as_dict, self.scored)
+        out: dict[str, Any] = plain(
             {
                 **facts,
-                "attitude_filters": filters,
                 "checkpoints_s": list(CHECKPOINTS_S),
-                "summaries": [as_dict(s) for s in self.summaries.values()],
-                "runs": [as_dict(s) for s in self.scored],
+                "summaries": list(summaries),
+                "runs": list(runs),
                 "bounds": bounds,
+                "attitude_filters": filters,
             }
-        )  # type: ignore[no-any-return]
+        )
+        return out
+
+
+def _ratio(pairs: Sequence[tuple[float, float]]) -> str:
+    """RMS of the first over RMS of the second, with its interval over resampled pairs."""
+    square = np.square(np.array(pairs).reshape(-1, 2))
+    if len(square) == 0 or not square[:, 1].any():
+        return ""
+    share = float(np.sqrt(square[:, 0].sum() / square[:, 1].sum()))
+    if len(square) < 3:
+        return number(share)
+    drawn = np.random.default_rng(1).integers(0, len(square), (_RESAMPLED, len(square)))
+    sums = square[drawn].sum(axis=1)
+    low, high = np.sqrt(np.quantile(sums[:, 0] / np.maximum(sums[:, 1], 1e-12), (0.025, 0.975)))
+    mark = " <" if high < 1.0 else " >" if low > 1.0 else ""
+    return f"{share:.2f} ({low:.2f}-{high:.2f}){mark}"
 
 
 def _fold(fold: Callable[..., Any], values: Sequence[Cell]) -> Cell:
