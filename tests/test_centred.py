@@ -92,6 +92,23 @@ def spiked(n=1000):
     return points
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(2, 3), st.integers(1, 14), st.integers(0, 2**32 - 1), st.floats(-1e4, 1e4))
+def test_moments_count_directions_as_far_as_they_can(d, n, seed, shift):
+    """n places give n directions, up to 6 in the plane and 10 in space; on a circle or sphere one fewer."""
+    places = np.random.default_rng(seed).uniform(-300.0, 300.0, (n, d))
+    most = 6 if d == 2 else 10
+    got = moments(np.repeat(places, 7, 0) + shift).directions(np.eye(d), np.full(d, shift), 200.0)
+    assert got <= min(n, most)
+    apart = ring(n, 200.0, seed=seed) if d == 2 else ball(n, 200.0, seed=seed)
+    assert moments(np.repeat(apart, 7, 0) + shift).directions(np.eye(d), np.full(d, shift), 200.0) <= min(n, most - 1)
+    angles = np.arange(n) * 2 * np.pi / n
+    even = 200.0 * np.stack((np.cos(angles), np.sin(angles)), 1)
+    axes = np.eye(d)[:, :2]
+    deep = even if d == 2 else np.column_stack((even, np.full(n, 650.0)))
+    assert moments(np.repeat(deep, 7, 0) + shift).directions(axes, np.full(d, shift), 200.0) == min(n, 5)
+
+
 # ---------------------------------------------------------------- equal to each other and to the batch
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from figures import ALL_2D, ALL_3D, ball, figure, fitted, ring, rotation, sample, seen_from, taught
+from figures import ALL_2D, ALL_3D, ROUND, ball, figure, fitted, ring, rotation, sample, seen_from, taught
 
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.estimators.fit import Fit, Refusal
@@ -10,7 +10,7 @@ from magmav.core.types import Shaping, mat3, vec3
 
 ALL = [(m, 2) for m in ALL_2D] + [(m, 3) for m in ALL_3D]
 FITTED = [n for n in ESTIMATORS if n != "kalman"]
-NO_ARC = {Refusal.ARC_TOO_SHORT, Refusal.NOT_AN_ELLIPSE, Refusal.NO_ROTATION, Refusal.COLLINEAR}
+NO_ARC = {Refusal.ARC_TOO_SHORT, Refusal.NOT_AN_ELLIPSE, Refusal.NO_ROTATION, Refusal.COLLINEAR, Refusal.PLANAR}
 
 
 def line(n, d):
@@ -105,6 +105,54 @@ def test_banked_turns_too_noisy_for_a_sphere_are_called_that_and_not_a_standstil
     bank = r.uniform(-0.25, 0.25, 500)
     points = seen_from(bank, 0.0 * bank, np.linspace(0.0, 12.0, 500), (205.0, 0.0, 430.0)) + r.normal(0, 25.0, (500, 3))
     assert fitted(method, points) is Refusal.ARC_TOO_SHORT
+
+
+def test_points_in_one_plane_want_a_bank_and_are_no_line():
+    flat = np.column_stack((ring(300, 200.0, (310.0, -140.0)), np.full(300, 430.0)))
+    for points in (flat, flat @ rotation(3, 0.3, 0.2, 0.1).T):
+        assert fitted("ellipsoid", points) is Refusal.PLANAR
+        assert isinstance(fitted("bullock", points), Fit)
+    assert fitted("ellipsoid", np.column_stack((line(50, 2), np.full(50, 7.0)))) is Refusal.COLLINEAR
+    assert "bank" in Refusal.PLANAR.value
+
+
+@pytest.mark.parametrize("method", [m for m in ALL_2D if m not in ("minmax", "sytnyk")])
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_as_many_headings_as_unknowns_prove_nothing(method, noise):
+    """Repeated values fit whatever they are, and a sigma of 0 would follow; an ellipse has five unknowns."""
+    for n, fine in ((3, False), (4, method != "ellipse"), (7, True)):
+        a = np.repeat(0.3 + np.arange(n) * 2 * np.pi / n, 60)
+        points = 200.0 * np.stack((np.cos(a), np.sin(a)), 1) + (310.0, -140.0)
+        points += np.random.default_rng(n).normal(0.0, noise, points.shape)
+        got = fitted(method, points)
+        # Noise that was measured is a sigma that holds, for a circle: see below.
+        assert isinstance(got, Fit) is (fine or (noise > 0.0 and n == 3 and method != "ellipse"))
+        if noise == 0.0 and n == 3 and method != "ellipse":
+            assert got is Refusal.FEW_HEADINGS
+            deep = np.column_stack((points, np.full(len(points), 650.0)))
+            assert fitted(method, deep) is Refusal.FEW_HEADINGS
+
+
+@pytest.mark.parametrize("method", ROUND)
+def test_three_headings_with_noise_claim_what_is_true(method):
+    squares = []
+    for seed in range(60):
+        r = np.random.default_rng(seed)
+        a = np.repeat((0.0, 2.0, 4.0), 100)
+        got = fitted(method, 200.0 * np.stack((np.cos(a), np.sin(a)), 1) + r.normal(0.0, 3.0, (300, 2)))
+        squares.append(got.centre @ np.linalg.solve(got.covariance, got.centre) / 2.0)
+    assert 0.7 < np.sqrt(np.mean(squares)) < 1.2
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 4.0, 8.0])
+def test_three_and_four_headings_leave_an_ellipse_open(noise):
+    for seed in range(5):
+        r = np.random.default_rng(seed)
+        for places in ((0.0, 2.1, 4.2), (0.0, 1.57, 3.14, 4.71), (0.0, 1.0, 3.1, 4.4)):
+            a = np.repeat(places, 100)
+            points = 200.0 * np.stack((np.cos(a), np.sin(a)), 1) + r.normal(0.0, noise, (len(a), 2))
+            assert isinstance(fitted("ellipse", points), Refusal)
+            assert isinstance(fitted("sytnyk", points), Refusal)
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 1), (5, 4), (2, 3, 3)])

@@ -136,14 +136,17 @@ def _in_directions(m: Moments, method: Round, spread: Array, axes: Array, indepe
         return Refusal.NO_ROTATION
     if float(spread[0]) < method.curvature * noise2:
         return Refusal.ARC_TOO_SHORT
+    shift = m.shift if m.shift is not None else np.zeros(m.dimensions)
+    middle = axes @ (axes.T @ shift + m.scale * centre)
+    if m.directions(axes, middle, m.scale * math.sqrt(square)) < k + 2:
+        return Refusal.FEW_HEADINGS  # as many as there are unknowns: any values fit, and look as good as exact
     inverse = np.linalg.inv(s.vv - noise2 * np.eye(k))
     covariance = inverse * (square * noise2 / max(m.effective * independent, 1.0))
     if method.biased:
         drawn = noise2 * (inverse @ (centre - s.mean))
         covariance = covariance + np.outer(drawn, drawn)
-    shift = m.shift if m.shift is not None else np.zeros(m.dimensions)
     return Fit(
-        centre=axes @ (axes.T @ shift + m.scale * centre),
+        centre=middle,
         radius=m.scale * math.sqrt(square),
         residual=m.scale * math.sqrt(residual2),
         covariance=axes @ covariance @ axes.T * m.scale**2,

@@ -22,7 +22,9 @@ from magmav.core.estimators.fit import Array, Fit, Refusal
 from magmav.core.estimators.moments import Moments, quadratic
 
 _NO_RANK = 1e-10  # smallest eigenvalue of the regressors' correlation
+_FLAT = 1e-9  # smallest over largest variance of the points: rounding
 _LONGEST = 3.0  # largest axis over smallest: beyond it is no soft iron but an arc
+_NOTHING_BUT_NOISE = 0.5  # share; 3 or 4 headings, which leave a shape open, have .91 to 1.18, any arc under .28
 _SHAPE = 0.1  # one sigma, and error by noise, of the shape; half of it is an error of heading in radians
 _THREE_QUARTERS = 0.5  # lmin / lmax of the corrected points
 
@@ -73,8 +75,8 @@ def conic_fit(m: Moments, least: int, independent: float = 1.0) -> Fit | Refusal
     mean_w, scatter_w = m.moved(-middle)
     spread = scatter_w[:d, :d] / m.weight
     reach = np.linalg.eigvalsh(spread)
-    if not reach[0] > 1e-9 * reach[-1]:
-        return Refusal.COLLINEAR
+    if not reach[0] > _FLAT * reach[-1]:
+        return Refusal.PLANAR if reach[-2] > _FLAT * reach[-1] else Refusal.COLLINEAR
     rows = _REGRESSORS[d]
     mean, moments = rows @ mean_w, rows @ (scatter_w / m.weight) @ rows.T
     unit = np.sqrt(np.diag(moments)[:size])
@@ -103,19 +105,18 @@ def conic_fit(m: Moments, least: int, independent: float = 1.0) -> Fit | Refusal
     if noise2 > (NO_CIRCLE * radius) ** 2:
         return Refusal.NO_ROTATION
     covariance = _covariance(correlation, unit, own_misfit, m.effective * independent)
-    bias = _bias(correlation, unit, p, forms, spread, noise2)
+    gain, right = _noise(forms, spread, noise2)
+    bias = np.linalg.solve(correlation, (right - gain @ p) / unit) / unit
     covariance = covariance + np.outer(bias, bias)
     n = len(forms)
     if float(np.linalg.eigvalsh(covariance[:n, :n])[-1]) > _SHAPE**2:
         return Refusal.ARC_TOO_SHORT
-    import os
-    L=np.linalg.cholesky(correlation); N_=_N(forms,spread,size)/np.outer(unit,unit)*noise2
-    global SHARE
-    SHARE=float(np.linalg.eigvalsh(np.linalg.solve(L,np.linalg.solve(L,N_).T))[-1])
     rounded = np.linalg.eigvalsh(matrix @ spread @ matrix)
     roundness = float(rounded[0] / rounded[-1])
     if roundness < (WEAK_ARC if d == 2 else SHORT_ARC):
         return Refusal.ARC_TOO_SHORT
+    if _share(correlation, gain / np.outer(unit, unit)) > _NOTHING_BUT_NOISE:
+        return Refusal.FEW_HEADINGS
     # G c = l, so G dc = dl + sum_k dp_k A_k c.
     to_centre = np.linalg.solve(G, np.hstack(((forms @ centre).T, np.eye(d))))
     shift = m.shift if m.shift is not None else np.zeros(d)
@@ -132,31 +133,27 @@ def conic_fit(m: Moments, least: int, independent: float = 1.0) -> Fit | Refusal
     )
 
 
-SHARE=0.0
-def _N(forms,spread,size):
-    n=len(forms)
-    N = np.zeros((size, size))
-    N[:n, :n] = 4.0 * np.einsum("aij,jk,bki->ab", forms, spread, forms)
-    N[n:, n:] = 4.0 * np.eye(size - n)
-    return N
-
-
 def _covariance(correlation: Array, unit: Array, misfit2: float, effective: float) -> Array:
     out: Array = np.linalg.inv(correlation) / np.outer(unit, unit) * (misfit2 / max(effective, 1.0))
     return out
 
 
-def _bias(correlation: Array, unit: Array, p: Array, forms: Array, spread: Array, noise2: float) -> Array:
-    """What noise of variance ``noise2`` in u does to p, to first order: C^-1 (n - N p).
+def _noise(forms: Array, spread: Array, noise2: float) -> tuple[Array, Array]:
+    """What noise of variance ``noise2`` in u adds to the moments of the regressors, N, and with |u|^2, n.
 
-    N is the mean of J J' and n that of J j', with J and j the gradients of regressors and of |u|^2, times the noise's
-    variance. Gradients: 2 A_k u, 2 e_i, 2 u. Origin at the mean of u, so its second moments are ``spread``.
+    To first order it then moves p by C^-1 (n - N p). N is the mean of J J' and n that of J j', with J and j the
+    gradients of regressors and of |u|^2: 2 A_k u, 2 e_i, 2 u. Origin at the mean of u, so its second moments are
+    ``spread``.
     """
-    size, n = len(p), len(forms)
-    N = np.zeros((size, size))
-    N[:n, :n] = 4.0 * np.einsum("aij,jk,bki->ab", forms, spread, forms)
-    N[n:, n:] = 4.0 * np.eye(size - n)
-    right = np.zeros(size)
-    right[:n] = 4.0 * np.einsum("aij,ji->a", forms, spread)
-    out: Array = noise2 * np.linalg.solve(correlation, (right - N @ p) / unit) / unit
-    return out
+    n, d = len(forms), len(spread)
+    gain, right = np.zeros((n + d, n + d)), np.zeros(n + d)
+    gain[:n, :n] = np.einsum("aij,jk,bki->ab", forms, spread, forms)
+    gain[n:, n:] = np.eye(d)
+    right[:n] = np.einsum("aij,ji->a", forms, spread)
+    return 4.0 * noise2 * gain, 4.0 * noise2 * right
+
+
+def _share(correlation: Array, gain: Array) -> float:
+    """The share of noise in the combination of regressors that has most of it, 0 to about 1."""
+    root = np.linalg.inv(np.linalg.cholesky(correlation))
+    return float(np.linalg.eigvalsh(root @ gain @ root.T)[-1])

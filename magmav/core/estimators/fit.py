@@ -23,13 +23,14 @@ class Refusal(Enum):
     NOT_FINITE = "a point is not a number, or beyond any compass"
     NO_ROTATION = "points scatter about no circle: not turned, or disturbed, or tilted too far to level first"
     COLLINEAR = "all points lie on one line"
+    PLANAR = "all points lie in one plane: bank the vehicle while it turns"
     ARC_TOO_SHORT = "too short an arc, or too thin a band of tilts: turn the vehicle further, and bank it"
-    FEW_HEADINGS = "points from too few headings: they say nothing of how good they are; turn the vehicle all the way round"
+    FEW_HEADINGS = "points from too few headings to tell how well they fit: turn the vehicle all the way round"
     EXTREMES = "the extremes do not belong to the figure of all points: never met (turn all the way round), or a spike"
     NOT_AN_ELLIPSE = "no ellipse fits: not turned all the way round, or disturbed, or tilted too far to level first"
 
 
-WEAK = "rests on so short an arc that a little noise or soft iron moves it far: turn the vehicle further, and bank it"
+WEAK = "rests on little (short arc, few headings, a spike), which noise or soft iron moves far: turn further, and bank"
 """What ``Fit.weak`` means, as a sentence."""
 
 
@@ -45,7 +46,8 @@ class Fit:
     matrix     : (d, d), determinant 1, takes the ellipse to a circle; the identity where no soft iron is fitted
     roundness  : smallest over largest variance of the corrected points in the seen directions. A whole circle has 1,
                  270 degrees .50, 180 degrees .19, 60 degrees .02
-    weak       : a figure, but resting on so short an arc that a little noise or soft iron moves it far
+    weak       : a figure, but resting on so short an arc, or on extremes so far from the rest of the points, that a
+                 little noise or soft iron moves it far
     """
 
     centre: Array

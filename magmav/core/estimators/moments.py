@@ -102,6 +102,12 @@ class Moments:
         d = self.dimensions
         return self.scatter[:d, :d] / self.weight
 
+    def middle(self) -> Array:
+        """Mean of the points, (d,), in their own unit."""
+        shift = np.zeros(self.dimensions) if self.shift is None else self.shift
+        out: Array = shift + self.scale * self.mean[: self.dimensions]
+        return out
+
     def spreads(self) -> bool:
         """Whether the points differ by more than rounding."""
         if self.shift is None:
@@ -126,7 +132,7 @@ class Moments:
         d, k = axes.shape
         i, j = _PAIRS[k]
         shift = np.zeros(d) if self.shift is None else self.shift
-        _, scatter = self.moved((shift - centre) / self.scale)
+        _, scatter = self.moved(axes @ (axes.T @ (shift - centre)) / self.scale)
         ratio = self.scale / radius
         rows = np.zeros((k + len(i), len(scatter)))
         rows[:k, :d] = axes.T * ratio

@@ -12,7 +12,8 @@ degrees for A = [1.2 .2; .2 .8]. And an ellipse whose axes are those of the sens
 farthest point is noise.
 
 Streaming keeps, for each of 64 directions, the point that lies farthest in it: all that extremes are made of.
-Whether there is an ellipse at all is judged by the conic fit; that judge is ours.
+Whether there is an ellipse at all, and whether the extremes are its own, is judged by the conic fit. That judge is
+ours, not the paper's.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from magmav.core.estimators.ellipse import conic_fit
 from magmav.core.estimators.fit import Array, Fit, Refusal
+from magmav.core.estimators.minmax import FAR, POORER, off_centre
 from magmav.core.estimators.moments import Moments
 
 _DIRECTIONS = 64
@@ -83,16 +85,28 @@ class SytnykFitter:
         centre, to_unit = turn_and_rescale(self._extremes)
         radius = 1.0 / math.sqrt(float(np.linalg.det(to_unit)))
         matrix = radius * to_unit
+        residual = m.misfit(centre, matrix.T @ matrix, radius)
+        away = off_centre(centre, np.ones(2, dtype=bool), m, judged)
+        if away > FAR or residual > judged.residual + POORER * radius:
+            return Refusal.EXTREMES
         spread = matrix @ m.covariance() @ matrix.T
         rounded = np.linalg.eigvalsh(spread)
         return Fit(
             centre=centre,
             radius=radius,
-            residual=m.misfit(centre, matrix.T @ matrix, radius),
+            residual=residual,
             covariance=None,
             seen=np.eye(2),
             matrix=matrix,
             roundness=float(rounded[0] / rounded[-1]),
-            weak=judged.weak,
+            weak=judged.weak or away > FAR / 2.0,
             samples=m.samples,
         )
+
+    def then(self, later: SytnykFitter) -> SytnykFitter:
+        """These points and after them ``later``'s. ValueError where the moments do not go together."""
+        out = SytnykFitter(self._moments.then(later._moments), self._least)
+        farther = later._reach > self._reach
+        out._reach = np.where(farther, later._reach, self._reach)
+        out._extremes = np.where(farther[:, None], later._extremes, self._extremes)
+        return out
