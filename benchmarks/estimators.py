@@ -18,7 +18,7 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ class Task:
     estimators: tuple[str, ...]
     bound: bool
     peers: Ready
+    bias_mg: float | None = None  # sigma per axis instead of the scenario's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,10 @@ class Judged:
 
 def judged(task: Task) -> Judged:
     """Fly, and run every method over it."""
-    flight = fly(SCENARIOS[task.scenario], task.seed)
+    scenario = SCENARIOS[task.scenario]
+    if task.bias_mg is not None:
+        scenario = replace(scenario, compass=replace(scenario.compass, bias_mg=task.bias_mg, bias_length_mg=None))
+    flight = fly(scenario, task.seed)
     heard = tape(flight)
     runs = [run(name, heard) for name in task.estimators]
     scored = [score(flight, heard, one) for one in runs]
@@ -104,6 +108,14 @@ def peer_names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(out))
 
 
+def milligauss(text: str) -> float:
+    """A size. ValueError otherwise."""
+    value = float(text)
+    if not 0.0 <= value <= 2000.0:
+        raise ValueError(f"bias: want 0 to 2000 mG, got {text}")
+    return value
+
+
 def measured(tasks: Sequence[Task], jobs: int, console: Console) -> list[Judged]:
     """All tasks, in the order given, whoever finishes first."""
     done: dict[tuple[str, int], Judged] = {}
@@ -128,6 +140,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     p.add_argument("--scenarios", type=chosen, default=chosen("all"), help="names, or all, reference, new")
     p.add_argument("--estimators", type=names, default=names("all"), help="names, or all")
     p.add_argument("--peers", type=peer_names, default=peer_names("all"), help="names, or all, own, none")
+    p.add_argument("--bias", type=milligauss, metavar="MG", help="hard iron of this sigma per axis in all scenarios")
     p.add_argument("--no-bound", action="store_true", help="leave the Cramer-Rao bound out (2 s a flight)")
     p.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     p.add_argument("--markdown", type=Path, help="write the tables here instead of to standard output")
@@ -140,18 +153,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     a = _arguments(argv)
     console = Console(stderr=True, highlight=False)
     able = ready(a.peers, partial(console.print, soft_wrap=True))
-    tasks = [Task(s.name, seed, a.estimators, not a.no_bound, able) for s in a.scenarios for seed in a.seeds]
+    tasks = [Task(s.name, seed, a.estimators, not a.no_bound, able, a.bias) for s in a.scenarios for seed in a.seeds]
     got = measured(tasks, max(a.jobs, 1), console)
     bounds = {(j.task.scenario, j.task.seed): j.bound for j in got if j.bound is not None}
     headings = {(j.task.scenario, j.task.seed): j.headings for j in got if j.headings}
     results = Results([s for j in got for s in j.scored], bounds, headings)
     facts: dict[str, Any] = {"seeds": [a.seeds.start, a.seeds.stop], "judging": a.seeds.start >= JUDGING}
+    facts["bias_mg"] = a.bias
     facts["pins"] = [asdict(pin) for pin in pins(able.pythons.get("magyc"))] if set(able.names) & set(OWN) else []
     facts["missing"] = list(able.missing)
     kind = "judging" if facts["judging"] else "TUNING"
     notes = [
         f"{len(a.seeds)} {kind} seeds ({a.seeds.start} to {a.seeds.stop - 1}), {len(a.scenarios)} scenarios, 180 s."
     ]
+    notes += [f"Hard iron of {a.bias:g} mG per axis (sigma) in all scenarios."] if a.bias is not None else []
     notes += [f"Left out: {why}." for why in able.missing]
     text = results.markdown(notes, lambda name: name in ESTIMATORS)
     if facts["pins"]:

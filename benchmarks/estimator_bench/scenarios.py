@@ -56,6 +56,11 @@ class Scenario:
     reference: bool = True
     jsbsim: str | None = None  # name of a flight of jsbsim_flights instead of a motion
 
+    @property
+    def tells_enough(self) -> bool:
+        """Full telemetry, and a motion that teaches: a verdict may be asked for within a minute."""
+        return not self.weak and self.link.gps and self.link.attitude_hz >= 10.0
+
 
 _ROUGH = Link(10.0, 10.0, True, 0.20, 0.01, 0.003, 0.020)
 _FINE = Link(50.0, 50.0)
