@@ -29,7 +29,7 @@ from estimator_bench.peer_runs import NAMES, OWN, Ready, filter_headings, peer_s
 from estimator_bench.pins import Pin, pin_table, pins
 from estimator_bench.running import run, tape
 from estimator_bench.scenarios import SCENARIOS, chosen
-from estimator_bench.score import Scored, nearest, score
+from estimator_bench.score import NOTHING_DEG, Scored, nearest, score
 from estimator_bench.tables import Results
 from estimator_bench.telemetry import fly
 from rich.console import Console
@@ -167,6 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{len(a.seeds)} {kind} seeds ({a.seeds.start} to {a.seeds.stop - 1}), {len(a.scenarios)} scenarios, 180 s."
     ]
     notes += [f"Hard iron of {a.bias:g} mG per axis (sigma) in all scenarios."] if a.bias is not None else []
+    notes += [f"{NOTHING_DEG:.2f} degrees, the RMS of any heading at all, stands where a method gave no answer."]
     notes += [f"Left out: {why}." for why in able.missing]
     text = results.markdown(notes, lambda name: name in ESTIMATORS)
     if facts["pins"]:

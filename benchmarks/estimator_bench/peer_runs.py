@@ -92,10 +92,10 @@ def _foreign(value: dict[str, Any]) -> Answer | None:
 
 
 def _packed(flight: Flight, c: peers.Columns) -> dict[str, Any]:
+    """For a runner. The model's field is told even where no position is sent: MAVProxy lets one type it in."""
     return {
         **dict(zip(("t_s", "mag_mg", "rate_rads", "roll_rad", "pitch_rad"), c[:5], strict=True)),
         "model_n_mg": flight.errors.model_n_mg,
-        "has_field": c.field_mg is not None,
         "checkpoints_s": np.array(CHECKPOINTS_S),
     }
 

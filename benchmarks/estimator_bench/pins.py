@@ -52,7 +52,7 @@ def pins(python: str | None) -> list[Pin]:
         told = shipped_pins(
             python,
             {"t_s": t_s, "mag_mg": mag, "rate_rads": rate, "roll_rad": nil, "pitch_rad": nil,
-             "model_n_mg": FIELD_N_MG, "has_field": True, "checkpoints_s": np.array([1e9])},
+             "model_n_mg": FIELD_N_MG, "checkpoints_s": np.array([1e9])},
         )  # fmt: skip
     length = float(np.linalg.norm(FIELD_N_MG))
     methods: dict[str, Callable[[], Array | None]] = {

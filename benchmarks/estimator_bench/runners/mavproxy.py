@@ -72,8 +72,6 @@ def main():
         name = "mavproxy_ell" if elliptical else "mavproxy"
         for t in flight["checkpoints_s"]:
             try:
-                if not flight["has_field"]:
-                    raise ValueError("needs a position")
                 answer = fit(magfit, Vector3, flight, t, elliptical)
             except (ValueError, ArithmeticError) as error:
                 answer = {"error": str(error)}
