@@ -20,9 +20,10 @@ from magmav.core.estimators.moments import Moments
 
 _FULL = 0.6
 """An axis counts when its range is this much of the largest: half a turn gives .5, soft iron of 1.2 to .8 gives .67."""
-FAR = 0.1
+FAR = 0.12
 """Beyond this share of the radius the middle of the extremes is not the figure's, and by half of it weak. Whole turns
-with 3 % of noise stay under .06; five headings give .06 to .10, three .18 to .25, a spike of half a radius .22."""
+with 3 % of noise stay under .06; five headings give .06 to .10, three .18 to .25, a spike of half a radius .22, banked
+turns where z was not met .10."""
 POORER = 0.1  # so much of the radius may the residual be larger than that of the circle of all points
 _ENOUGH, _THREE_QUARTERS = 0.3, 0.5  # roundness: five eighths of a turn, and three quarters
 
@@ -68,10 +69,14 @@ class MinMaxFitter:
         centre = np.where(met, middle, 0.0)
         radius = float(half[met].mean())
         residual = m.misfit(centre, axes @ axes.T, radius)
-        # Soft iron moves a circle that is not turned evenly, and neither an ellipse nor the extremes.
-        conic = conic_fit(m, self._least)
-        away = off_centre(centre, met, m, conic if isinstance(conic, Fit) else judged)
-        if away > FAR or residual > judged.residual + POORER * radius:
+        away = off_centre(centre, met, m, judged) / radius
+        if away > FAR / 2.0:
+            # Soft iron moves a circle that is not turned evenly, and neither an ellipse nor the extremes.
+            conic = conic_fit(m, self._least)
+            away = off_centre(centre, met, m, conic) / radius if isinstance(conic, Fit) else away
+        # Banked turns are no circle on the level axes alone: there a residual says nothing of the extremes.
+        alike = judged.seen.shape[1] == axes.shape[1]
+        if away > FAR or (alike and residual > judged.residual + POORER * radius):
             return Refusal.EXTREMES
         return Fit(
             centre=centre,
@@ -93,10 +98,10 @@ class MinMaxFitter:
 
 
 def off_centre(centre: Array, met: Array, m: Moments, judge: Fit) -> float:
-    """How far a centre (d,) is from another figure's of the same points along the axes ``met``, in radii.
+    """How far a centre (d,) is from another figure's of the same points along the axes ``met``, in their unit.
 
     Where the other saw nothing the points lie in a plane, and it stands for the mean of the points.
     """
     unseen = np.eye(m.dimensions) - judge.seen @ judge.seen.T
     away = centre - judge.centre - unseen @ m.middle()
-    return float(np.linalg.norm(away[met])) / judge.radius
+    return float(np.linalg.norm(away[met]))

@@ -86,7 +86,7 @@ class SytnykFitter:
         radius = 1.0 / math.sqrt(float(np.linalg.det(to_unit)))
         matrix = radius * to_unit
         residual = m.misfit(centre, matrix.T @ matrix, radius)
-        away = off_centre(centre, np.ones(2, dtype=bool), m, judged)
+        away = off_centre(centre, np.ones(2, dtype=bool), m, judged) / radius
         if away > FAR or residual > judged.residual + POORER * radius:
             return Refusal.EXTREMES
         spread = matrix @ m.covariance() @ matrix.T
