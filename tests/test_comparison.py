@@ -100,7 +100,7 @@ def test_the_first_half_knows_nothing_of_the_second():
     n = 60 * HZ
     jump = np.zeros((n, 3))
     jump[n // 2 + HZ :] = (150.0, -80.0, 60.0)
-    names = ["kalman", "bullock", "minmax"]
+    names = ["kalman", "bullock", "taubin"]
     a, b = (
         rows(compare(told(frames), Settings(), earth_model, clock=ticking(), only=names))
         for frames in (flight(seconds=60.0), flight(seconds=60.0, offsets_mg=jump))
