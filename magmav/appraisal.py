@@ -115,6 +115,7 @@ def describe(
         "axes": [a.value for a in last.verdict.axes],
         "state": last.verdict.state.name,
         "reasons": [{"code": r.name, "text": r.text} for r in last.verdict.reasons],
+        "causes": [cause.as_json() for cause in vehicle.causes.of(compass)],
         "heading": full,
         "heading_offsets_only": offsets_only,
         "heading_smoothed": smoothed_scores(log, reference) if smoothing != "off" else None,

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from magmav.coaching import Coaching
 from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult, Verdict
 from magmav.mavlink.announce import Announcer
 from magmav.mavlink.autopilot.ardupilot import plan_change, wanted_names
@@ -88,6 +89,7 @@ class MagCompanion:
         self._fetch = ParamFetch(wanted_names(COMPASSES), self.presence)
         self._budget = Budget(settings.wire.budget_bps)
         self.announcer = Announcer(self._budget, settings.wire.heading_hz)
+        self._coaching = Coaching(pipeline.vehicles, lambda text, now: self.announcer.say(_INFO, f"MMAG {text}", now))
         self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, self._budget)
 
     def ask_for(self, names: Iterable[str]) -> None:
@@ -126,6 +128,8 @@ class MagCompanion:
         heading = record.published
         degrees = math.degrees(heading.magnetic_rad) if heading.valid else math.nan
         self.announcer.heading(record.compass, degrees, record.published_boot_ns, now_ns)
+        if self.settings.coach.say:
+            self._coaching.on_record(record)
         if self._states.get(record.compass) is not record.verdict.state:
             self._states[record.compass] = record.verdict.state
             self._say_verdict(record, now_ns)

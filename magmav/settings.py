@@ -112,6 +112,12 @@ class Upload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ] = 150.0
 
 
+class Coach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The next motion that would teach most, and what is wrong with a compass, in words."""
+
+    say: Annotated[bool, _knob("say it by STATUSTEXT too, at most every 30 s; `magmav run` always shows it")] = False
+
+
 class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Everything that can be chosen."""
 
@@ -124,6 +130,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     gate: Gate = field(default_factory=Gate)
     wire: Wire = field(default_factory=Wire)
     upload: Upload = field(default_factory=Upload)
+    coach: Coach = field(default_factory=Coach)
 
 
 class Knob(Struct, frozen=True):
@@ -191,9 +198,7 @@ def checked(settings: Settings, where: str) -> Settings:
     if settings.attitude.own not in OWN_TILTS:
         raise SettingsError(f"{where}: attitude.own: {settings.attitude.own!r}; choose {', '.join(OWN_TILTS)}")
     if settings.heading.smooth not in SMOOTHINGS:
-        raise SettingsError(
-            f"{where}: heading.smooth: {settings.heading.smooth!r}; choose {', '.join(SMOOTHINGS)}"
-        )
+        raise SettingsError(f"{where}: heading.smooth: {settings.heading.smooth!r}; choose {', '.join(SMOOTHINGS)}")
     return settings
 
 

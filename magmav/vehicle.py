@@ -12,6 +12,7 @@ import numpy as np
 
 from magmav.core import gate
 from magmav.core.assemble import Assembler
+from magmav.core.causes import Causes
 from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.correction import without_third
 from magmav.core.estimators import ESTIMATORS
@@ -67,6 +68,7 @@ class Boot:
     calibrations: StoredCalibrations
     phase: Phase
     began_ns: int | None
+    causes: Causes
 
     def started_ns(self) -> int | None:
         """Boot time of take-off, or of the first data where nothing flew."""
@@ -85,6 +87,7 @@ class Vehicle:
         self.learn_for_s: float | None = None
         self.assembler = Assembler(system, settings.attitude.own)
         self.phase = Phase()
+        self.causes = Causes()
         self._books = _books()
         self.former: Boot | None = None
         self.channels: dict[int, Channel] = {}
@@ -136,8 +139,10 @@ class Vehicle:
                         self.settle(compass)
             case ThrottleReading():
                 self.calibrations.throttle(r.share)
+                self.causes.throttle(r.share)
             case CurrentReading():
                 self.calibrations.current(r.ampere)
+                self.causes.current(r.ampere)
             case TimeReading():
                 self._unix_minus_boot_ns = r.unix_ns - r.boot_ns
         self._after_reboot()
@@ -154,6 +159,7 @@ class Vehicle:
             self._epochs[compass] = held.epoch(compass)
             self.assembler.restart(compass)
             channel.restart()
+            self.causes.restart(compass)
         if not held.undoable(compass):
             self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
             return None
@@ -175,6 +181,8 @@ class Vehicle:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
+        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, circumstances.grounded)
+        finding = self._doubted(finding, self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
             t_ns=t_ns,
@@ -227,6 +235,12 @@ class Vehicle:
         was = f.heading
         true = wrap_tau(was.true_rad + yaw - was.magnetic_rad) if was.true_valid else 0.0
         return replace(f, heading=replace(was, magnetic_rad=yaw, true_rad=true))
+
+    def _doubted(self, f: Finding, reason: Reason | None) -> Finding:
+        """Offsets that rest on a wrong mounting or scale are not for writing, however sure they are."""
+        if reason is None or f.verdict.state is State.NO_DATA:
+            return f
+        return replace(f, verdict=Verdict(State.REFUSED, f.verdict.axes, (reason, *f.verdict.reasons)))
 
     def _to_store(self, compass: int, finding: Finding) -> Vec3:
         """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4)."""
@@ -310,10 +324,11 @@ class Vehicle:
             return
         self._reboots = self.assembler.reboots
         self.counts["reboots"] += 1
-        self.former = Boot(self.calibrations, self.phase, self.started_ns())
+        self.former = Boot(self.calibrations, self.phase, self.started_ns(), self.causes)
         kind = self.phase.kind
         self.phase = Phase()
         self.phase.kind = kind
+        self.causes = Causes()
         self._books = _books()
         self._epochs.clear()
         self._settle_until_ns.clear()

@@ -39,6 +39,7 @@ def _until_signal(link: Link) -> Iterator[Callable[[], bool]]:
 
 def run(o: argparse.Namespace) -> int:
     """The service, until stopped."""
+    from magmav.coaching import Coaching
     from magmav.link.open import open_link
     from magmav.link.recorder import TlogRecorder
     from magmav.live import Session
@@ -61,6 +62,8 @@ def run(o: argparse.Namespace) -> int:
             writer = stack.enter_context(RecordWriter(o.records))
             watchers.append(lambda reading, record: None if record is None else writer.write(record))
         session = Session.on(link, settings, world_magnetic_model, store, watchers)
+        coaching = Coaching(session.pipeline.vehicles, lambda text, _: _log.warning("%s", text))
+        session.service.watchers += (lambda reading, record: None if record is None else coaching.on_record(record),)
         _warn(link)
         port = getattr(link, "port", None)
         _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {port})" if port else "")

@@ -32,6 +32,8 @@ class Reason(Enum):
     STALE = (19, "no fresh magnetometer data")
     FROZEN = (20, "magnetometer value never changes: sensor stuck")
     TWO_AXES = (22, "two axes used: the third comes from the dip of the place; without a position no heading")
+    MOUNTING_WRONG = (23, "compass is mounted turned against the vehicle: see causes")
+    SCALE_WRONG = (24, "compass shows the wrong strength of field: see causes")
     NO_CALIBRATION = (21, "no calibration that is ready for this compass")
     ARMED = (30, "vehicle is armed")
     NOT_LANDED = (31, "vehicle is not known to be on the ground")

@@ -184,6 +184,7 @@ def _compass(compass: Json) -> RenderableType:
         )
     lines: list[RenderableType] = [Text.assemble(_line(head), verdict)]
     lines += [_para(f"    - {_word(r.get('text') or r.get('code'))}") for r in compass.get("reasons") or []]
+    lines += [_para(f"    ! {_word(c.get('text') or c.get('code'))}") for c in compass.get("causes") or []]
     stored = ", ".join(f"{_word(n)} {_number(v, 'g')}" for n, v in (compass.get("stored") or {}).items())
     facts = [_para(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass)]
     return Group(Text(), *lines, table, *facts)
