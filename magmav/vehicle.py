@@ -100,6 +100,7 @@ class Vehicle:
         self._latest: dict[int, Record] = {}
         self._publishers: dict[int, Publisher] = {}
         self._first_ns: int | None = None
+        self._throttle: float | None = None
         self._reboots = 0
         if not math.isnan(settings.place.lat_deg):
             self._place = (settings.place.lat_deg, settings.place.lon_deg, settings.place.alt_m)
@@ -138,6 +139,7 @@ class Vehicle:
                     for compass in changed if book is self.calibrations else ():
                         self.settle(compass)
             case ThrottleReading():
+                self._throttle = r.share
                 self.calibrations.throttle(r.share)
                 self.causes.throttle(r.share)
             case CurrentReading():
@@ -172,7 +174,9 @@ class Vehicle:
             except ValueError:
                 self.counts[f"compass {compass}: two axes: sensor is mounted upright"] += 1
                 return None
-        sample = self.assembler.mag(r, undo, shaping, learn, axes)
+        here = self.expected(unix_ns)
+        model_mg = None if here is None else (here.horizontal_mg, here.down_mg)
+        sample = self.assembler.mag(r, undo, shaping, learn, axes, model_mg, self._throttle)
         self._after_reboot()
         if sample is None:
             return self._frozen(r, t_ns, channel)

@@ -150,7 +150,14 @@ class Assembler:
             self._compasses[compass].restart = True
 
     def mag(
-        self, reading: MagReading, undo: Callable[[Vec3], Vec3], shaping: Shaping, learn: bool, axes: int = 3
+        self,
+        reading: MagReading,
+        undo: Callable[[Vec3], Vec3],
+        shaping: Shaping,
+        learn: bool,
+        axes: int = 3,
+        model_mg: tuple[float, float] | None = None,
+        throttle: float | None = None,
     ) -> Sample | None:
         """A Sample when this is a fresh value whose tilt is known.
 
@@ -197,6 +204,8 @@ class Assembler:
             tilt_from=state.source,
             learn=learn,
             axes=axes,
+            model_mg=model_mg,
+            throttle=throttle,
         )
         known.sent_b_mg, known.fresh_ns, known.turned_rad = reading.field_b_mg, reading.boot_ns, 0.0
         known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False

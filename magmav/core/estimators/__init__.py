@@ -4,6 +4,7 @@ An estimator takes Samples one at a time in O(1) and says on request what it bel
 come from. It can be copied at any moment (copy.deepcopy, pickle) and the copy goes on to the same bits.
 
 kalman           a linear Kalman filter: levelled field constant but for the turning the gyro reports (the default)
+adaptive         a bank of filters over headings and models: also soft iron, drift, throttle (not the default yet)
 minmax           Sawicki 2017, method I: middle of the extremes
 kasa, bullock    methods II and III: the same least-squares circle or sphere, by two sets of equations
 taubin           the same without the pull of short arcs to small circles
@@ -80,8 +81,15 @@ def _kalman() -> Estimator:
     return KalmanEstimator()
 
 
+def _adaptive() -> Estimator:
+    from magmav.core.estimators.adaptive import AdaptiveEstimator
+
+    return AdaptiveEstimator()
+
+
 ESTIMATORS: dict[str, Callable[[], Estimator]] = {
     "kalman": _kalman,
+    "adaptive": _adaptive,
     "minmax": partial(fitted, "minmax"),
     "kasa": partial(fitted, "kasa"),
     "bullock": partial(fitted, "bullock"),

@@ -1,0 +1,137 @@
+"""The hypotheses and their weights: begun over all headings, weighed by how well they foretell, merged and dropped."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.layout import Array, Index
+from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.rotation import TAU
+
+_COLUMNS = ("x", "p", "model", "log_weight", "scale", "disturbance_mg", "square", "product", "last", "prior", "walk_mg")
+
+
+def field_covariance(h_mg: float, v_mg: float, n: Tuning) -> Array:
+    """Of the model's (H, V) as this sensor shows them, (2, 2) mG^2: the model's error, and the sensor's gain."""
+    both = np.array((h_mg, v_mg))
+    out: Array = n.model_mg**2 * np.eye(2) + n.gain**2 * np.outer(both, both)
+    return out
+
+
+class Bank:
+    """All hypotheses side by side: x (K, n), p (K, n, n), and for each its model, log weight and noise."""
+
+    def __init__(self, x: Array, p: Array, model: Index, log_weight: Array, n: Tuning) -> None:
+        self.x, self.p, self.model, self.log_weight = x, p, model, log_weight
+        k = len(x)
+        self.scale = np.ones(k)  # of the reading's variance
+        self.disturbance_mg = np.full(k, n.disturbance_mg)
+        self.square, self.product = np.zeros(k), np.zeros(k)  # of the whitened innovation, and with its neighbour
+        self.last = np.zeros((k, 3))  # whitened innovation before
+        self.walk_mg = np.array([MODELS[m].iron_walk_mg for m in model])  # per square root of a second
+        self.prior = np.log([MODELS[m].weight for m in model])
+
+    @staticmethod
+    def begun(field: tuple[float, float, float, float], n: Tuning) -> Bank:
+        """One filter per heading and model. field: mean and sigma of H and of V, mG."""
+        h, h_sigma, v, v_sigma = field
+        k = n.yaws * len(MODELS)
+        x, p = np.zeros((k, at.SIZE)), np.zeros((k, at.SIZE, at.SIZE))
+        model = np.repeat(np.arange(len(MODELS)), n.yaws)
+        x[:, at.ALPHA] = np.tile(np.arange(n.yaws) * TAU / n.yaws, len(MODELS))
+        x[:, at.H], x[:, at.V] = h, v
+        diagonal = p.reshape(k, -1)[:, :: at.SIZE + 1]
+        diagonal[:, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
+        diagonal[:, at.B] = n.prior_iron_mg**2
+        diagonal[:, at.H], diagonal[:, at.V] = h_sigma**2, v_sigma**2
+        p[:, at.H : at.V + 1, at.H : at.V + 1] += field_covariance(h, v, n) - n.model_mg**2 * np.eye(2)
+        diagonal[:, at.E] = n.tilt_rad**2
+        diagonal[:, at.D] = n.disturbance_mg**2
+        diagonal[:, at.K] = n.throttle_mg**2
+        for m, one in enumerate(MODELS):
+            rows = model == m
+            diagonal[rows, at.S] = np.repeat((one.soft_diagonal**2, one.soft_cross**2), 3)
+        diagonal[:, at.G] = n.gyro_rads**2
+        diagonal[:, at.T] = n.delay_s**2
+        diagonal[:, at.KAPPA] = n.kappa**2
+        log_weight = np.log([MODELS[m].weight / n.yaws for m in model])
+        return Bank(x, p, model, log_weight, n)
+
+    def lose_heading(self, n: Tuning) -> None:
+        """Any heading again: the best of each model goes on from every direction, with all else that it knows."""
+        w = self.weights()
+        best = [max(np.flatnonzero(self.model == m), key=lambda i: w[i]) for m in np.unique(self.model)]
+        share = np.array([w[self.model == self.model[i]].sum() for i in best])
+        self.keep(np.repeat(best, n.yaws))
+        self.log_weight = np.log(np.repeat(share / n.yaws, n.yaws) + 1e-300)
+        self.x[:, at.ALPHA] += np.tile(np.arange(n.yaws) * TAU / n.yaws, len(best))
+        self.p[:, at.ALPHA, :] = self.p[:, :, at.ALPHA] = 0.0
+        self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
+
+    def tell_field(self, h_mg: float, v_mg: float, n: Tuning) -> None:
+        """The world model's field, once a position is known: a measurement of H and V."""
+        hv = slice(at.H, at.V + 1)
+        both = np.array((h_mg, v_mg))
+        expected = self.p[:, hv, hv] + field_covariance(h_mg, v_mg, n)
+        gain = self.p[:, :, hv] @ np.linalg.inv(expected)
+        self.x += (gain @ (both - self.x[:, hv])[:, :, None])[:, :, 0]
+        self.p -= gain @ self.p[:, hv, :]
+        self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def weights(self) -> Array:
+        """(K,) that add to one."""
+        w = np.exp(self.log_weight - self.log_weight.max())
+        return np.asarray(w / w.sum())
+
+    def keep(self, rows: Index) -> None:
+        """Only these, in this order."""
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[rows])
+
+    def weigh(self, log_likelihood: Array, dt_s: float, n: Tuning) -> None:
+        """Better foretold, more believed; old merit fades, so that a model can come back."""
+        fade = math.exp(-dt_s / n.forget_s)
+        self.log_weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
+        self.log_weight -= self.log_weight.max()
+
+    def tidy(self, n: Tuning) -> None:
+        """Drop what is not believed, merge what has become the same; the best of each model stays."""
+        w = self.weights()
+        order = np.argsort(-w, kind="stable")
+        kept: list[int] = []
+        for i in order:
+            same = [j for j in kept if self.model[j] == self.model[i]]
+            if not same:
+                kept.append(int(i))
+                continue
+            if w[i] < n.prune_below * w[order[0]]:
+                continue
+            twin = next((j for j in same if self._alike(int(i), j, n.merge_sigma)), None)
+            if twin is None:
+                kept.append(int(i))
+            else:
+                self.log_weight[twin] = np.logaddexp(self.log_weight[twin], self.log_weight[i])
+        self.keep(np.array(sorted(kept)))
+
+    def _alike(self, i: int, j: int, line: float) -> bool:
+        sigma = np.sqrt(np.diagonal(self.p[j]))
+        away = math.remainder(self.x[i, 0] - self.x[j, 0], TAU)
+        iron = np.abs(self.x[i, at.B] - self.x[j, at.B])
+        return abs(away) < line * sigma[0] + 1e-3 and bool((iron < line * sigma[at.B] + 0.5).all())
+
+    def mixture(self) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) of all together; alpha the short way round."""
+        w = self.weights()
+        x = self.x.copy()
+        best = int(np.argmax(w))
+        x[:, 0] = x[best, 0] + (x[:, 0] - x[best, 0] + math.pi) % TAU - math.pi
+        mean = w @ x
+        away = x - mean
+        covariance = np.einsum("k,kij->ij", w, self.p) + np.einsum("k,ki,kj->ij", w, away, away)
+        return mean, covariance

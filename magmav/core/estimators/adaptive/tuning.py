@@ -1,0 +1,63 @@
+"""Every number that was chosen, with its unit and where it comes from (estimation.md section 5 unless said)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """One account of the compass: how likely before any data, and what it lets change."""
+
+    weight: float
+    iron_walk_mg: float  # per square root of a second
+    soft_diagonal: float
+    soft_cross: float
+
+
+HARD = Model(0.70, 0.05, 0.01, 0.007)
+SOFT = Model(0.27, 0.05, 0.04, 0.028)
+DRIFT = Model(0.03, 0.7, 0.01, 0.007)
+MODELS = (HARD, SOFT, DRIFT)
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """Noise, priors and lines."""
+
+    yaws: int = 12
+    prior_iron_mg: float = 300.0
+    model_mg: float = 5.0  # of the world model, per component
+    blind_h_mg: tuple[float, float] = (230.0, 80.0)  # without a position: mean and sigma
+    blind_v_mg: float = 200.0
+    reading_mg: float = 15.0
+    scale_lo: float = 0.08  # of the reading's variance, as the innovations show it
+    scale_hi: float = 4.0
+    sync_s: float = 0.02
+    tilt_rad: float = math.radians(0.6)
+    tilt_tau_s: float = 12.0
+    own_tilt_rad: float = math.radians(1.5)
+    disturbance_mg: float = 1.5
+    disturbance_lo_mg: float = 0.5
+    disturbance_hi_mg: float = 4.0
+    disturbance_tau_s: float = 4.0
+    throttle_mg: float = 60.0
+    gyro_rads: float = math.radians(0.6)
+    delay_s: float = 0.03
+    kappa: float = 0.03
+    gain: float = 0.02  # of the sensor as a whole: the field it shows is the model's but for this share
+    turn_walk_rad: float = math.radians(0.2)  # per square root of a second
+    turn_scale: float = 0.01
+    doubt_nis: float = 14.0
+    reject_nis: float = 400.0
+    temper: float = 0.25
+    forget_s: float = 60.0
+    prune_every: int = 32
+    adapt_every: int = 5
+    prune_below: float = 1e-4
+    merge_sigma: float = 0.35
+    change_tau_s: float = 1.5
+    change_chi2: float = 60.0
+    change_disturbance: float = 60.0  # of |d|^2 / sigma^2
+    change_hold_s: float = 3.0

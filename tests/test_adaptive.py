@@ -1,0 +1,209 @@
+"""The adaptive bank: its equation against finite differences, its algebra against filterpy's, and flights."""
+
+import copy
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter
+from honest_flight import EXPECTED, MOTIONS, samples
+from synthetic_flight import HARD_IRON_MG
+
+from magmav.core.estimators import ESTIMATORS
+from magmav.core.estimators.adaptive import AdaptiveEstimator, orientation, without_prior
+from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.bank import Bank, field_covariance
+from magmav.core.estimators.adaptive.measurement import Equation, noise
+from magmav.core.estimators.adaptive.process import advance
+from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.types import vec3
+
+HERE = (EXPECTED.horizontal_mg, EXPECTED.down_mg)
+
+
+def placed(flight):
+    return [replace(s, model_mg=HERE) for s in flight]
+
+
+def taught(flight, estimator=None):
+    estimator = estimator or AdaptiveEstimator()
+    for s in flight:
+        estimator.step(s)
+    return estimator
+
+
+def states(seed, k=4):
+    """Plausible states, far enough from zero that every term shows."""
+    rng = np.random.default_rng(seed)
+    x = np.zeros((k, at.SIZE))
+    x[:, at.ALPHA] = rng.uniform(-3, 3, k)
+    x[:, at.B] = rng.normal(0, 200, (k, 3))
+    x[:, at.H], x[:, at.V] = rng.uniform(150, 300, k), rng.uniform(-450, 450, k)
+    for part, size in ((at.E, 0.01), (at.D, 4), (at.K, 50), (at.G, 0.01)):
+        x[:, part] = rng.normal(0, size, (k, 3))
+    x[:, at.T], x[:, at.KAPPA] = rng.normal(0, 0.03, k), rng.normal(0, 0.02, k)
+    matrix = np.eye(3) + rng.normal(0, 0.05, (3, 3))
+    body = orientation(*rng.uniform(-1.2, 1.2, 3))
+    return x, body, matrix, rng.normal(0, 0.5, 3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_column_of_the_jacobian_is_the_derivative(seed):
+    """At S = 0 and small tilt errors; the tilt, delay and kappa columns are exact in themselves."""
+    x, body, matrix, rate = states(seed)
+    x[:, at.E] = x[:, at.T : at.T + 1] = x[:, at.KAPPA :] = 0.0
+    equation = Equation(len(x))
+    y, j, u = equation(x, body, matrix, rate, 0.3)
+    j, y = j.copy(), y.copy()
+    assert np.linalg.norm(u, axis=1) == pytest.approx(np.hypot(x[:, at.H], x[:, at.V]))
+    for i in range(at.SIZE):
+        step = 1e-6 * max(1.0, float(np.abs(x[:, i]).max()))
+        up, down = x.copy(), x.copy()
+        up[:, i] += step
+        down[:, i] -= step
+        slope = (equation(up, body, matrix, rate, 0.3)[0] - equation(down, body, matrix, rate, 0.3)[0]) / (2 * step)
+        assert slope == pytest.approx(j[:, :, i], rel=1e-6, abs=1e-5), i
+
+
+def test_time_is_f_p_f_and_q():
+    rng = np.random.default_rng(1)
+    n, dt = Tuning(), 0.7
+    x, *_ = states(2)
+    root = rng.normal(0, 1, (4, at.SIZE, at.SIZE))
+    p = root @ root.transpose(0, 2, 1)
+    down, walk, dist = np.array((0.1, -0.2, 0.6)), np.array((0.05, 1.5, 0.05, 0.3)), np.full(4, 2.0)
+    f, q = np.eye(at.SIZE), np.zeros((4, at.SIZE, at.SIZE))
+    f[at.ALPHA, at.G] = down
+    tilt, short = math.exp(-dt / n.tilt_tau_s), math.exp(-dt / n.disturbance_tau_s)
+    f[at.E, at.E], f[at.D, at.D] = tilt * np.eye(3), short * np.eye(3)
+    q[:, 0, 0] = 0.02
+    for i in range(3):
+        q[:, 1 + i, 1 + i] = walk**2 * dt
+        q[:, 6 + i, 6 + i] = (1 - tilt**2) * 0.01**2
+        q[:, 9 + i, 9 + i] = (1 - short**2) * dist**2
+    want_x, want_p = x @ f.T, f @ p @ f.T + q
+    advance(x, p, dt, down, 0.02, 0.01, walk, dist, n)
+    assert x == pytest.approx(want_x, abs=1e-12)
+    assert p == pytest.approx(want_p, rel=1e-10, abs=1e-10)
+
+
+def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(monkeypatch):
+    """Same model, same noise, no doubt and no adaptation: only the algebra is left."""
+    calm = Tuning(doubt_nis=1e12, adapt_every=10**9, change_chi2=1e12, change_disturbance=1e12, prune_every=10**9)
+    mine = AdaptiveEstimator(calm)
+    flight = placed(samples("figure eight", 5, seconds=12.0))
+    bank = Bank.begun((HERE[0], calm.model_mg, HERE[1], calm.model_mg), calm)
+    bank.keep(np.array([3]))
+    mine._bank, mine._model_mg = bank, HERE
+    theirs = ExtendedKalmanFilter(dim_x=at.SIZE, dim_z=3)
+    theirs.x, theirs.P = bank.x[0].copy(), bank.p[0].copy()
+    equation, yaw = Equation(1), 0.0
+    for s in flight[1:]:
+        yaw += s.yaw_step_rad
+        body = orientation(s.roll_rad, s.pitch_rad, yaw)
+        x, p = theirs.x[None].copy(), theirs.P[None].copy()
+        turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * s.yaw_step_rad) ** 2
+        iron, dist = np.array([MODELS[0].iron_walk_mg]), np.array([calm.disturbance_mg])
+        advance(x, p, s.dt_s, body[:, 2] * s.dt_s, turn2, calm.tilt_rad, iron, dist, calm)
+        theirs.x, theirs.P = x[0], p[0]
+        y, j, u = equation(x, body, np.eye(3), s.rate_b_rads, 0.0)
+        smear = (calm.sync_s * math.hypot(*s.rate_b_rads)) ** 2
+        r = noise(u, np.array([calm.reading_mg**2]), smear)[0]
+        theirs.update(s.mag_b_mg, lambda _, j=j: j[0].copy(), lambda _, y=y: y[0].copy(), R=r)
+        mine.step(s)
+        assert mine._bank.x[0] == pytest.approx(theirs.x, rel=1e-9, abs=1e-8)
+        assert mine._bank.p[0] == pytest.approx(theirs.P, rel=1e-6, abs=1e-6)
+
+
+def test_taking_the_prior_back_leaves_what_the_data_say():
+    """Linear and Gaussian: with the wide prior from the start the covariance is the same."""
+    rng = np.random.default_rng(3)
+    n = Tuning()
+    rows = rng.normal(0, 1, (40, at.SIZE))
+    other = np.diag(rng.uniform(0.5, 2.0, at.SIZE))
+    hv = slice(at.H, at.V + 1)
+    information = rows.T @ rows + other
+    known, wide = information.copy(), information.copy()
+    known[hv, hv] += np.linalg.inv(field_covariance(*HERE, n))
+    wide[hv, hv] += np.diag((1 / n.blind_h_mg[1] ** 2, 1 / n.blind_v_mg**2))
+    got = without_prior(np.linalg.inv(known), *HERE, n)
+    assert got == pytest.approx(np.linalg.inv(wide), rel=1e-6, abs=1e-9)
+
+
+def test_merging_hypotheses_keeps_all_belief():
+    n = Tuning()
+    bank = Bank.begun((*HERE[:1], 5.0, HERE[1], 5.0), n)
+    bank.x[:, at.ALPHA] = 0.3
+    bank.log_weight = np.log(np.random.default_rng(1).uniform(0.1, 1.0, len(bank)))
+    before = {m: bank.weights()[bank.model == m].sum() for m in range(len(MODELS))}
+    bank.tidy(n)
+    assert len(bank) == len(MODELS)
+    assert dict(zip(bank.model.tolist(), bank.weights(), strict=True)) == pytest.approx(before)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+def test_stopping_and_resuming_changes_no_bit(copied):
+    flight = placed(samples("survey", 7, seconds=20.0))
+    one = taught(flight)
+    two = taught(flight[90:], copied(taught(flight[:90])))
+    a, b = one.estimate(EXPECTED), two.estimate(EXPECTED)
+    assert np.array_equal(a.hard_iron_b_mg, b.hard_iron_b_mg)
+    assert np.array_equal(a.covariance_mg2, b.covariance_mg2)
+    assert len(pickle.dumps(one)) < 100_000
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_it_is_right_and_knows_how_right(motion):
+    ratios = []
+    for seed in range(8):
+        e = taught(placed(samples(motion, 40 + seed))).estimate(EXPECTED)
+        sigma = np.sqrt(np.diag(e.covariance_mg2))
+        ratios.append((e.hard_iron_b_mg - HARD_IRON_MG) / sigma)
+        assert np.all(sigma < 12.0)
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
+def test_a_step_of_the_iron_is_followed_within_eight_seconds():
+    iron = np.tile(HARD_IRON_MG, (600, 1))
+    iron[300:] += (45.0, -45.0, 30.0)
+    flight = placed(samples("figure eight", 3, seconds=60.0, iron_mg=iron))
+    e = taught(flight[:380])
+    got = e.estimate(EXPECTED)
+    assert got.changed_ago_s < 8.0
+    assert np.abs(got.hard_iron_b_mg - iron[-1])[:2] == pytest.approx(0.0, abs=6.0)
+
+
+def test_soft_iron_is_told_from_hard():
+    bend = np.array([[1.05, 0.02, -0.03], [0.02, 0.96, 0.03], [-0.03, 0.03, 1.01]])
+    plain = samples("figure eight", 9, seconds=120.0, iron_mg=np.zeros(3), whole=False)
+    bent = [replace(s, mag_b_mg=vec3(bend @ s.mag_b_mg + HARD_IRON_MG, "m")) for s in placed(plain)]
+    e = taught(bent).estimate(EXPECTED)
+    assert np.linalg.inv(e.soft_iron_b) == pytest.approx(bend, abs=0.02)
+    assert e.hard_iron_b_mg == pytest.approx(HARD_IRON_MG, abs=8.0)
+
+
+def test_without_a_position_it_learns_and_with_one_later_it_is_surer():
+    flight = samples("figure eight", 11, seconds=40.0)
+    blind = taught(flight).estimate(None)
+    late = taught([*flight[:200], *placed(flight[200:])]).estimate(EXPECTED)
+    sigma = [np.sqrt(np.diag(e.covariance_mg2)) for e in (blind, late)]
+    assert sigma[1][2] < 0.9 * sigma[0][2]  # down is what the model knows best
+    assert np.all(sigma[1] < 1.01 * sigma[0])
+    for e, s in zip((blind, late), sigma, strict=True):
+        assert np.all(np.abs(e.hard_iron_b_mg - HARD_IRON_MG) < 4.0 * s + 3.0)
+
+
+def test_after_a_gap_any_heading_is_possible_and_the_iron_is_kept():
+    flight = placed(samples("figure eight", 13, seconds=40.0))
+    e = taught(flight[:300])
+    before = e.estimate(EXPECTED).hard_iron_b_mg
+    turned = [replace(flight[300], gap=True, yaw_step_rad=2.5), *flight[301:]]
+    after = taught(turned, e).estimate(EXPECTED)
+    assert after.hard_iron_b_mg == pytest.approx(before, abs=6.0)
+    assert after.changed_ago_s > 1000.0
+
+
+def test_it_can_be_chosen():
+    assert isinstance(ESTIMATORS["adaptive"](), AdaptiveEstimator)
