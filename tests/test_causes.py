@@ -111,9 +111,13 @@ def test_memory_does_not_grow_and_holds_the_last_five_minutes():
 
 def test_derivatives_agree_with_finite_differences():
     r = np.random.default_rng(3)
-    state = causes_fit._State(about(x=20, z=70), np.array([430.0, 9, 8, 7, 1, 2, 3]), r.normal(0, 200, (4, 2)), 1.1)
+    late = np.array([0.0, 0.0, 1.0, 1.0])
+    shared = np.array([430.0, 9, 8, 7, 1, 2, 3, 4, 5, 6])
+    state = causes_fit._State(about(x=20, z=70), shared, r.normal(0, 200, (4, 2)), 1.1, late)
     state = state.moved(
-        np.concatenate([r.normal(0, 0.02, 9), r.normal(0, 5, 6), r.normal(0, 5, 2), [0.02], np.zeros(4)])
+        np.concatenate(
+            [r.normal(0, 0.02, 9), r.normal(0, 5, 6), r.normal(0, 5, 2), [0.02], r.normal(0, 5, 3), np.zeros(4)]
+        )
     )
     by = state.derivatives(causes_fit.AMPERE)
     for p in range(causes_fit.SHARED + 1):
@@ -154,8 +158,8 @@ def test_sigmas_are_honest():
     """Pooled over motions and seeds: error over sigma of gain, turn and drift. Loose above too: priors are in it."""
     off = []
     for motion in MOTIONS:
-        for seed in range(6):
-            f = fitted(samples(motion, 100 + seed, seconds=50.0))
+        for seed in range(5):
+            f = fitted(samples(motion, 100 + seed, seconds=45.0))
             spread = np.sqrt(np.diag(f.covariance))
             turn = turn_of(f.turn) / spread[causes_fit.TURN]
             off.append([(f.gain - 1.0) / spread[0], *turn, f.drift_rads / spread[causes_fit.DRIFT]])
@@ -169,7 +173,7 @@ def test_sigmas_are_honest():
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_a_sound_compass_is_left_alone(motion):
     """Iron, noise, wandering tilt, a walking gyro, a model 3 mG off, swinging power, one wild reading in a hundred."""
-    for seed in range(4):
+    for seed in range(3):
         r = np.random.default_rng(seed)
         flight = samples(motion, 200 + seed, seconds=60.0, earth_mg=EARTH_MG + r.normal(0.0, 3.0, 3))
         wild = [
@@ -269,6 +273,16 @@ def test_AT_3a_a_strange_field_is_named_at_the_tenth_sample_with_its_value():
     assert sum(text.endswith(cause.text) for _, text in said) == 1
     steps = [t for t, text in said if not text.endswith(cause.text)]
     assert len(steps) == 2 and steps[1] - steps[0] >= EVERY_NS
+
+
+def test_a_strange_field_that_was_ordinary_iron_is_withdrawn_and_a_magnets_is_kept():
+    """Where the Earth's field is weak, 140 mG of iron can leave under 150 mG to see for a while."""
+    for iron, stays in ((np.array([140.0, 0, 0]), False), (np.array([700.0, 0, 300.0]), True)):
+        found = Causes()
+        flight = samples("figure eight", 10, iron_mg=iron)
+        for i, s in enumerate(flight):
+            found.step(s, NOTHING, EXPECTED, vec3((100.0 if i < 20 else 400.0, 0, 0), "u"), False)
+        assert ("MAGNET_NEARBY" in codes(found)) is stays
 
 
 def test_AT_3d_every_cause_has_a_stable_code_a_sentence_and_stands_in_the_page():

@@ -7,8 +7,9 @@ from itertools import product
 
 import numpy as np
 import pytest
+from flight_rig import Flight, staying
 from honest_flight import Motion, body_rates, field_in_body
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_flight import HARD_IRON_MG, turn
 
@@ -25,6 +26,7 @@ from magmav.core.types import (
     Verdict,
     vec3,
 )
+from magmav.settings import Settings, with_value
 
 ROVER, COPTER, PLANE, VTOL, BOAT = 10, 2, 1, 20, 11
 KINDS = (None, ROVER, COPTER, PLANE, VTOL, BOAT)
@@ -42,6 +44,7 @@ sigmas = st.tuples(*[st.floats(1.0, 300.0)] * 3)
 angles = st.floats(-0.5, 0.5)
 
 
+@settings(max_examples=40, deadline=None)
 @given(sigmas, angles, angles, st.sampled_from(KINDS))
 def test_every_advice_fits_a_text_and_can_be_followed(sigma, roll, pitch, kind):
     """MMAG c1: and the advice fit one STATUSTEXT, and a vehicle is asked only for what its kind can do (AT-1c)."""
@@ -56,6 +59,7 @@ def test_every_advice_fits_a_text_and_can_be_followed(sigma, roll, pitch, kind):
         assert "eight" not in text
 
 
+@settings(max_examples=30)
 @given(st.floats(0.1, 7.9), angles, angles, st.sampled_from(KINDS))
 def test_silent_when_every_axis_is_under_the_line(sigma, roll, pitch, kind):
     assert advise(estimate((sigma, sigma, sigma)), roll, pitch, None, kind) == ""
@@ -79,6 +83,7 @@ def test_already_banked_right_it_asks_for_the_left():
     assert advise(estimate((4, 4, 40)), math.radians(-12), 0.0, None, COPTER) == "bank 15 degrees right"
 
 
+@settings(max_examples=40, deadline=None)
 @given(sigmas, st.floats(0.05, 0.5), st.sampled_from(KINDS), st.floats(0.0, 6.28))
 def test_left_and_right_are_alike_and_heading_does_not_matter(sigma, roll, kind, heading):
     """Mirror vehicle and doubt: the mirrored advice, or one that is worth the same to within a hundredth."""
@@ -203,3 +208,17 @@ def test_AT_1c_a_boat_is_never_asked_to_bank_pitch_or_be_turned_over():
     for reason in Reason:
         verdict = Verdict(State.LEARNING, (AxisState.NOT_OBSERVED,) * 3, (reason,))
         assert not re.search("nose|invert|over", next_step(verdict, ""))
+
+
+def test_the_wire_hears_the_coach_only_where_it_is_asked_for(tmp_path):
+    """The first seconds on the ground: one hint that fits one text, or by default none."""
+    for say in (False, True):
+        folder = tmp_path / str(say)
+        folder.mkdir()
+        f = Flight(staying(), folder, settings=with_value(Settings(), "coach", "say", say))
+        f.fly(seconds=8.0)
+        f.end()
+        texts = [m.text for m in f.said() if m.get_type() == "STATUSTEXT"]
+        hints = [t for t in texts if "take off" in t]
+        assert hints == (["MMAG c1: take off: the ground teaches nothing"] if say else [])
+        assert not say or len(hints[0]) <= LONGEST

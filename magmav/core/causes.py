@@ -15,13 +15,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magmav.core.causes_blocks import AMPERE, ONE, Block, Blocks
-from magmav.core.causes_fit import DRIFT, GAIN, IRON, POWER, TURN, Array, Fit, fit, power_name, right_angles, turn_of
+from magmav.core.causes_fit import (
+    DRIFT,
+    GAIN,
+    IRON,
+    POWER,
+    STEP,
+    TURN,
+    Array,
+    Fit,
+    fit,
+    power_name,
+    right_angles,
+    turn_of,
+)
 from magmav.core.field import ExpectedField
 from magmav.core.orientation import MAVLINK, rotation
 from magmav.core.types import Estimate, Reason, Sample, Vec3
 
 EARTH_MG = (150.0, 950.0)
-_STRANGE_SAMPLES = 10
+_STRANGE_SAMPLES, _ORDINARY_MG = 10, 300.0
 _SIGMAS = 5.0
 _LEAST_BLOCKS, _LEAST_SAMPLES = 3, 100
 _TURN_RAD, _NEAR_RAD, _REFUSED_TURN_RAD = math.radians(8.0), math.radians(15.0), math.radians(15.0)
@@ -33,7 +46,6 @@ _POWER_CHI2 = 40.0
 _GROUND_MG, _AZIMUTH_RAD = 40.0, math.radians(4.0)
 _JUMP_MG, _JUMP_CHI2 = 30.0, 50.0
 _BAD_MG, _BAD_TIMES = 15.0, 2.5
-_TRUSTED_TIMES = 1.5  # a fit of the time since the iron changed must be better than the whole by this
 _FIT_AT = (3, 6, 12, 24)  # blocks; later every 15
 
 
@@ -113,7 +125,11 @@ class Causes:
         w = self._watched.get(compass)
         if w is None:
             return ()
-        return w.found if w.magnet is None else (w.magnet, *w.found)
+        if w.magnet is None:
+            return w.found
+        # Ordinary iron against a weak field of the Earth can add up to a strange one; once it is known it is no magnet.
+        ordinary = w.fitted is not None and float(np.linalg.norm(w.fitted.iron_b_mg)) < _ORDINARY_MG
+        return w.found if ordinary and w.strange < _STRANGE_SAMPLES else (w.magnet, *w.found)
 
     def of(self, compass: int) -> tuple[Cause, ...]:
         """Everything that is known to be wrong with a compass, from all data so far. Some 30 ms per compass."""
@@ -156,16 +172,11 @@ class Causes:
         if at == w.fitted_at or len(blocks) < _LEAST_BLOCKS or at[1] < _LEAST_SAMPLES:
             return
         w.fitted_at = at
-        now, every = fit(blocks, w.expected), blocks
-        late = [b for b in blocks if b.era == blocks[-1].era]
-        if len(blocks) > len(late) >= _LEAST_BLOCKS and sum(b.n for b in late) >= _LEAST_SAMPLES:
-            since = fit(late, w.expected)
-            if since.rms_mg * _TRUSTED_TIMES < now.rms_mg:
-                now, blocks = since, late
+        blocks, step_at = _since_the_last_change(blocks)
+        now = fit(blocks, w.expected, step_at)
         w.fitted = now
         ground = None if w.blocks.ground is None else _ground(now, blocks, w.blocks.ground)
-        changed = _changed(every, w.expected)
-        found = (changed, _mounting(now), _scale(now, w.expected), _power(now), _gyro(now), ground)
+        found = (_changed(now), _mounting(now), _scale(now, w.expected), _power(now), _gyro(now), ground)
         w.found = tuple(c for c in found if c is not None)
 
     def _against_others(self, compass: int) -> tuple[Cause, ...]:
@@ -189,19 +200,24 @@ class Causes:
         return tuple(out)
 
 
-def _changed(blocks: list[Block], expected: ExpectedField | None) -> Cause | None:
-    """The hard iron of the time before the last sudden change against that of the time since, each fitted alone."""
+def _since_the_last_change(blocks: list[Block]) -> tuple[list[Block], int | None]:
+    """The time before the last sudden change and the time since, and where the second begins (None: no change).
+
+    An estimator that searches says several times that the iron changed: what lies between is the search.
+    """
     eras: dict[int, list[Block]] = {}
     for b in blocks:
         eras.setdefault(b.era, []).append(b)
-    # An estimator that searches says so several times: what lies between is the search.
     long = [part for part in eras.values() if sum(b.n for b in part) >= _LEAST_SAMPLES]
-    if len(long) < 2 or long[-1][-1].era != blocks[-1].era:
-        return None
-    before, since = long[-2:]
-    was, now = fit(before, expected), fit(since, expected)
-    moved = now.iron_b_mg - was.iron_b_mg
-    spread = now.covariance[IRON, IRON] + was.covariance[IRON, IRON]
+    if len(eras) == 1 or not long or long[-1][-1].era != blocks[-1].era:
+        return blocks, None
+    before = long[-2] if len(long) > 1 else []
+    return [*before, *long[-1]], len(before) or None
+
+
+def _changed(f: Fit) -> Cause | None:
+    """Something magnetic came or went: before and after are told apart by one fit that shares all but the iron."""
+    moved, spread = f.step_b_mg, f.covariance[STEP, STEP]
     size = float(np.linalg.norm(moved))
     if size < _JUMP_MG or float(moved @ np.linalg.solve(spread, moved)) < _JUMP_CHI2:
         return None

@@ -163,7 +163,7 @@ class Blocks:
 
     def _drop(self, boot_s: float) -> None:
         """The iron had changed some time before it was noticed: that time belongs to neither side."""
-        self._filled, self._now, self._chained = 0, None, False
+        self._filled, self._now = 0, None
         if self.air and boot_s - self.air[-1].begin_s < BLOCK_S + _NOTICED_S:
             self.air.pop()
 

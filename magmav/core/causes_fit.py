@@ -28,12 +28,13 @@ _GAIN, _SOFT, _TURN = 0.5, 0.03, math.radians(60.0)
 _POWER = {AMPERE: 10.0, THROTTLE: 200.0}  # mG per ampere, and per full throttle
 _DRIFT = math.radians(2.0)  # rad/s
 _HOP = math.radians(4.0)  # what the gyro may lose from block to block beyond a constant drift: scale, walk
+_TILT = math.radians(0.3)  # what the attitude's slow error leaves in the turn, however long the flight
 _LEAST_MG = 3.0  # no fit is believed to be better than this
 _STEPS, _DONE = 14, 0.01  # Gauss-Newton stops when no unknown moves by more of its sigma
 _BETTER = 60.0  # by so much, in chi-squared, a right-angled mounting must beat none
 
 GAIN, SOFT, TURN, IRON, POWER = 0, slice(1, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-LEVEL, DOWNWARD, DRIFT, SHARED = 15, 16, 17, 18
+LEVEL, DOWNWARD, DRIFT, STEP, SHARED = 15, 16, 17, slice(18, 21), 21
 
 _SOFT_BASIS = np.array(
     [
@@ -91,7 +92,8 @@ class Fit:
     """What one stretch of flight says of a compass. Field in mG, angles in rad, body axes.
 
     turn : (3, 3) takes the field in true body axes to what the compass gives for it (before gain and soft iron).
-    covariance : (18, 18) of gain, soft iron (5), turn (3, small rotation), iron (3), power (3), h, v, drift.
+    step_b_mg : what came to the hard iron from the given block on; 0 where none was given.
+    covariance : (21, 21) of gain, soft iron (5), turn (3, small rotation), iron (3), power (3), h, v, drift, step (3).
     rms_mg : of the residual; plain_mg : the same with hard iron and power alone fitted.
     """
 
@@ -105,6 +107,7 @@ class Fit:
     level_mg: float
     down_mg: float
     drift_rads: float
+    step_b_mg: Array
     azimuth_rad: Array
     covariance: Array
     rms_mg: float
@@ -119,7 +122,8 @@ class Fit:
 class _Problem:
     """The blocks of one fit, stacked: sums (J, F, F), products with z (J, F, 3)."""
 
-    def __init__(self, blocks: Sequence[Block], expected: ExpectedField | None) -> None:
+    def __init__(self, blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | None) -> None:
+        self.late = np.array([float(step_at is not None and i >= step_at) for i in range(len(blocks))])
         sums = np.array([b.sums for b in blocks])
         self.x, self.y = sums[:, :FEATURES, :FEATURES], sums[:, :FEATURES, FEATURES:]
         self.square = float(np.einsum("jrr->", sums[:, FEATURES:, FEATURES:]))
@@ -161,50 +165,54 @@ class _Problem:
 
 
 def _linear(p: _Problem, turn: Array, variance: float) -> tuple[float, Array, Array]:
-    """The mounting held: v, b, k shared and the level field of every block, all linear.
+    """The mounting held: v, b, k, step shared and the level field of every block, all linear.
 
-    Misfit in mG^2, the shared unknowns (7,), the level fields (J, 2).
+    Misfit in mG^2, the shared unknowns (10,), the level fields (J, 2).
     """
     j = p.blocks
-    by = np.zeros((j, 9, FEATURES, 3))
-    by[:, 0, 0:3] = by[:, 7, 3:6] = by[:, 8, 6:9] = turn.T
+    by = np.zeros((j, 12, FEATURES, 3))
+    by[:, 0, 0:3] = by[:, 10, 3:6] = by[:, 11, 6:9] = turn.T
     for axis in range(3):
         by[:, 1 + axis, ONE, axis] = 1.0
-        by[:, 4 + axis, p.power_by or ONE, axis] = 1.0 if p.power_by else 0.0
+        by[:, 7 + axis, ONE, axis] = p.late
+        if p.power_by:
+            by[:, 4 + axis, p.power_by, axis] = 1.0
     matrix, right = p.normal(by, np.zeros((j, FEATURES, 3)))
-    size = 7 + 2 * j
+    size = 10 + 2 * j
     whole, side = np.zeros((size, size)), np.zeros(size)
-    whole[:7, :7], side[:7] = matrix[:, :7, :7].sum(axis=0), right[:, :7].sum(axis=0)
+    whole[:10, :10], side[:10] = matrix[:, :10, :10].sum(axis=0), right[:, :10].sum(axis=0)
     for i in range(j):
-        own = slice(7 + 2 * i, 9 + 2 * i)
-        whole[:7, own], whole[own, :7] = matrix[i, :7, 7:], matrix[i, 7:, :7]
-        whole[own, own], side[own] = matrix[i, 7:, 7:], right[i, 7:]
+        own = slice(10 + 2 * i, 12 + 2 * i)
+        whole[:10, own], whole[own, :10] = matrix[i, :10, 10:], matrix[i, 10:, :10]
+        whole[own, own], side[own] = matrix[i, 10:, 10:], right[i, 10:]
     v, v_sigma = (0.0, _FIELD_MG * 2.0) if p.expected is None else (p.expected.down_mg, 0.3 * p.expected.total_mg)
     k_sigma = _POWER.get(p.power_by, 1.0)
-    weights = np.array([v_sigma, *[_IRON_MG] * 3, *[k_sigma] * 3, *[_FIELD_MG] * (2 * j)]) ** -2.0
+    sigmas = [v_sigma, *[_IRON_MG] * 3, *[k_sigma] * 3, *[_IRON_MG] * 3, *[_FIELD_MG] * (2 * j)]
+    weights = np.array(sigmas) ** -2.0
     prior = np.zeros(size)
     prior[0] = v
     answer = np.linalg.solve(whole / variance + np.diag(weights), side / variance + weights * prior)
-    theta = np.einsum("jpfr,jp->jfr", by, np.hstack([np.tile(answer[:7], (j, 1)), answer[7:].reshape(j, 2)]))
-    return p.misfit(theta), np.array(answer[:7], dtype=np.float64), np.array(answer[7:], dtype=np.float64).reshape(j, 2)
+    theta = np.einsum("jpfr,jp->jfr", by, np.hstack([np.tile(answer[:10], (j, 1)), answer[10:].reshape(j, 2)]))
+    fields = np.array(answer[10:], dtype=np.float64).reshape(j, 2)
+    return p.misfit(theta), np.array(answer[:10], dtype=np.float64), fields
 
 
 class _State:
     """Where Gauss-Newton stands."""
 
-    def __init__(self, turn: Array, shared: Array, level: Array, gain: float) -> None:
-        self.start, self.turn = turn, turn
+    def __init__(self, turn: Array, shared: Array, level: Array, gain: float, late: Array) -> None:
+        self.start, self.turn, self.late = turn, turn, late
         strength = np.hypot(level[:, 0], level[:, 1])
         self.shared = np.zeros(SHARED)
         self.shared[GAIN] = gain
-        self.shared[IRON], self.shared[POWER] = shared[1:4], shared[4:7]
+        self.shared[IRON], self.shared[POWER], self.shared[STEP] = shared[1:4], shared[4:7], shared[7:10]
         self.shared[LEVEL], self.shared[DOWNWARD] = float(np.median(strength)) / gain, shared[0] / gain
         self.azimuth = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
 
     def moved(self, by: Array) -> _State:
         """A step away."""
         out = object.__new__(_State)
-        out.start, out.turn = self.start, turn_by(by[TURN]) @ self.turn
+        out.start, out.late, out.turn = self.start, self.late, turn_by(by[TURN]) @ self.turn
         out.shared, out.azimuth = self.shared + by[:SHARED], self.azimuth + by[SHARED:]
         out.shared[TURN] = turn_of(out.turn @ out.start.T)
         return out
@@ -224,7 +232,7 @@ class _State:
         j = len(self.azimuth)
         out = np.zeros((j, FEATURES, 3))
         out[:, :TOP] = np.einsum("jc,rs->jcsr", self.weights(), self.matrix()).reshape(j, TOP, 3)
-        out[:, ONE] = self.shared[IRON]
+        out[:, ONE] = self.shared[IRON] + self.late[:, None] * self.shared[STEP]
         if power_by:
             out[:, power_by] = self.shared[POWER]
         return out
@@ -254,6 +262,7 @@ class _State:
         for i in range(3):
             out[:, 6 + i, :TOP] = top(weights, gain * self.bend() @ _CROSS[i] @ self.turn)
             out[:, 9 + i, ONE, i] = 1.0
+            out[:, 18 + i, ONE, i] = self.late
             if power_by:
                 out[:, 12 + i, power_by, i] = 1.0
         out[:, LEVEL, :TOP] = top(np.stack([zero, c, s, -w * s, w * c], axis=1), d)
@@ -270,6 +279,7 @@ def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
     middle, sigma = np.zeros(SHARED), np.ones(SHARED)
     middle[GAIN], sigma[GAIN], sigma[SOFT], sigma[TURN] = 1.0, _GAIN, _SOFT, _TURN
     sigma[IRON], sigma[POWER], sigma[DRIFT] = _IRON_MG, _POWER.get(p.power_by, 1e-3), _DRIFT
+    sigma[STEP] = _IRON_MG if p.late.any() else 1e-3
     if here is None:  # without a position nothing tells gain from field
         sigma[GAIN] = 1e-3
         middle[LEVEL], sigma[LEVEL], sigma[DOWNWARD] = 230.0, _FIELD_MG, 2.0 * _FIELD_MG
@@ -292,9 +302,12 @@ def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
     return information, side
 
 
-def fit(blocks: Sequence[Block], expected: ExpectedField | None) -> Fit:
-    """The best account of these blocks (at least one). expected: None without a position; then gain is taken as 1."""
-    p = _Problem(blocks, expected)
+def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | None = None) -> Fit:
+    """The best account of these blocks (at least one).
+
+    expected : None without a position; then gain is taken as 1. step_at : from this block on there may be other iron.
+    """
+    p = _Problem(blocks, expected, step_at)
     candidates = right_angles()
     variance = 36.0 * max(0.1 * p.n / p.blocks, 1.0)
     tried = [(_linear(p, turn, variance), turn) for turn in candidates]
@@ -307,7 +320,7 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None) -> Fit:
     if expected is not None:
         strength = float(np.median(np.hypot(level[:, 0], level[:, 1])))
         gain = min(max(strength / max(expected.horizontal_mg, 50.0), 0.4), 2.0)
-    state = _State(turn, shared, level, gain)
+    state = _State(turn, shared, level, gain, p.late)
     theta = state.theta(p.power_by)
     for _ in range(_STEPS):
         variance = max(p.misfit(theta) / (3.0 * p.n), _LEAST_MG**2)
@@ -330,6 +343,7 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None) -> Fit:
         if float(np.abs(step / np.sqrt(np.diag(covariance))).max()) < _DONE:
             break
     x = state.shared
+    covariance[TURN, TURN] += np.eye(3) * _TILT**2
     return Fit(
         gain=float(x[GAIN]),
         soft=state.bend() - np.eye(3),
@@ -341,6 +355,7 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None) -> Fit:
         level_mg=float(x[LEVEL]),
         down_mg=float(x[DOWNWARD]),
         drift_rads=float(x[DRIFT]),
+        step_b_mg=x[STEP],
         azimuth_rad=state.azimuth,
         covariance=covariance[:SHARED, :SHARED],
         rms_mg=math.sqrt(max(p.misfit(theta), 0.0) / (3.0 * p.n)),
