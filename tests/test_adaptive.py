@@ -104,7 +104,8 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(monkeyp
         yaw += s.yaw_step_rad
         body = orientation(s.roll_rad, s.pitch_rad, yaw)
         x, p = theirs.x[None].copy(), theirs.P[None].copy()
-        turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * s.yaw_step_rad) ** 2
+        about_down = float(s.rate_b_rads @ body[:, 2]) * s.dt_s
+        turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * about_down) ** 2
         iron, dist = np.array([MODELS[0].iron_walk_mg]), np.array([calm.disturbance_mg])
         advance(x, p, s.dt_s, body[:, 2] * s.dt_s, turn2, calm.tilt_rad, iron, dist, calm)
         theirs.x, theirs.P = x[0], p[0]

@@ -171,3 +171,36 @@ def test_lost_attitude_hands_its_tilt_to_the_gyro():
     state = m.at(3000 * MS)
     assert state.source == "OWN"
     assert state.roll_rad == pytest.approx(0.5, abs=0.12)
+
+
+def euler(body_from_earth):
+    """Roll, pitch, yaw of a matrix; at the vertical any of the many that mean the same."""
+    r = body_from_earth
+    return math.atan2(r[1, 2], r[2, 2]), math.asin(max(-1.0, min(1.0, -r[0, 2]))), math.atan2(r[0, 1], r[0, 0])
+
+
+def test_the_own_frame_goes_through_the_vertical():
+    """A tail-sitter stands up, turns about the vertical, leans over on its back and comes down: no angle is special."""
+    hz, truth, motion = 50, np.eye(3), Motion()
+    worst = 0.0
+    for i in range(12 * hz):
+        t = i / hz
+        rate = np.array((0.6 * (4 < t < 7), 0.5 * (t < 4) - 0.4 * (t > 8), 0.02))
+        if i:
+            truth = turn_by(-rate / hz) @ truth
+        motion.attitude(AttitudeReading(1, "ATTITUDE", round(t * 1e9), *euler(truth), vec3(rate, "rate")))
+        state = motion.at(round(t * 1e9))
+        off = state.body_from_own @ truth.T
+        worst = max(worst, math.degrees(math.acos(min(1.0, (np.trace(off) - 1.0) / 2.0))))
+    assert abs(euler(truth)[1]) > 0.0
+    assert worst < 1.0
+
+
+def turn_by(v):
+    """Rotation by a vector, by its series: nothing of ours in it."""
+    k = np.array(((0.0, -v[2], v[1]), (v[2], 0.0, -v[0]), (-v[1], v[0], 0.0)))
+    out, term = np.eye(3), np.eye(3)
+    for n in range(1, 12):
+        term = term @ k / n
+        out = out + term
+    return out

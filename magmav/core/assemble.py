@@ -206,6 +206,7 @@ class Assembler:
             axes=axes,
             model_mg=model_mg,
             throttle=throttle,
+            body_from_own=state.body_from_own,
         )
         known.sent_b_mg, known.fresh_ns, known.turned_rad = reading.field_b_mg, reading.boot_ns, 0.0
         known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False

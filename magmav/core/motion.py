@@ -13,8 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from magmav.core.marg_attitude import Carried, MargAttitude
-from magmav.core.rotation import euler_rates, level_from_body, tilt_from_force, wrap_pi
-from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Vec3
+from magmav.core.rotation import (
+    body_from_earth,
+    euler_rates,
+    level_from_body,
+    rotation,
+    shortest_turn,
+    tilt_from_force,
+    wrap_pi,
+)
+from magmav.core.types import IDENTITY3, ZERO3, AttitudeReading, InertialReading, Mat3, Vec3
 
 _FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
 _RATES_HOLD_S = 0.25  # between attitudes further apart, rates say nothing: take the yaw step itself
@@ -37,6 +45,7 @@ class MotionState(NamedTuple):
     source: str
     epoch: int
     bridged: bool  # the yaw step over a long gap is still good
+    body_from_own: Mat3  # from a frame level with the earth that the gyro carries along; good at every attitude
 
 
 class Motion:
@@ -48,7 +57,9 @@ class Motion:
     def __init__(self, own: str = "complementary") -> None:
         self.seen_attitude = False
         self._att: AttitudeReading | None = None
-        self._recent: deque[tuple[AttitudeReading, float]] = deque(maxlen=12)  # with the integrated yaw
+        # With the integrated yaw, and the own frame.
+        self._recent: deque[tuple[AttitudeReading, float, Mat3]] = deque(maxlen=12)
+        self._own_frame: Mat3 = IDENTITY3
         self._yaw_rad = 0.0
         self._epoch = 0
         if own not in OWN_TILTS:
@@ -62,6 +73,7 @@ class Motion:
         last = self._att
         if last is not None and r.boot_ns <= last.boot_ns:
             return False
+        self._carry_frame(last, r)
         if last is not None:
             dt = (r.boot_ns - last.boot_ns) / 1e9
             if dt <= _RATES_HOLD_S:
@@ -74,8 +86,25 @@ class Motion:
                 self._epoch += 2
                 self._recent.clear()
         self._att, self.seen_attitude = r, True
-        self._recent.append((r, self._yaw_rad))
+        self._recent.append((r, self._yaw_rad, self._own_frame))
         return True
+
+    def _carry_frame(self, last: AttitudeReading | None, r: AttitudeReading) -> None:
+        """The own frame at this attitude: turned on by the gyro, then made level with it by the shortest way.
+
+        Turning about the vertical comes from the gyro alone (over long gaps from the attitude's own step), and no
+        angle is singular: a tail-sitter standing on its tail is like any other.
+        """
+        now = body_from_earth(r.roll_rad, r.pitch_rad, r.yaw_rad)
+        dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
+        if last is None or dt > _LOST_S:
+            self._own_frame = now
+        elif dt <= _RATES_HOLD_S:
+            carried = rotation(-0.5 * dt * (last.rate_b_rads + r.rate_b_rads)) @ self._own_frame
+            self._own_frame = shortest_turn(carried[:, 2], now[:, 2]) @ carried
+        else:
+            before = body_from_earth(last.roll_rad, last.pitch_rad, last.yaw_rad)
+            self._own_frame = now @ before.T @ self._own_frame
 
     def inertial(self, r: InertialReading) -> None:
         """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
@@ -107,19 +136,21 @@ class Motion:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
         a = self._att
         if a is not None and abs(boot_ns - a.boot_ns) <= _FRESH_NS:
-            yaw = self._yaw_rad
-            for earlier, its_yaw in reversed(self._recent):
+            yaw, frame = self._yaw_rad, self._own_frame
+            for earlier, its_yaw, its_frame in reversed(self._recent):
                 if abs(earlier.boot_ns - boot_ns) > abs(a.boot_ns - boot_ns):
                     break
-                a, yaw = earlier, its_yaw
+                a, yaw, frame = earlier, its_yaw, its_frame
             age = (boot_ns - a.boot_ns) / 1e9
             dr, dp, dy = euler_rates(a.roll_rad, a.pitch_rad, a.rate_b_rads)
             roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, yaw + dy * age
-            return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True)
+            frame = rotation(-age * a.rate_b_rads) @ frame
+            return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame)
         own = self._own.at(boot_ns)
         if own is None:
             return None
-        return MotionState(own.roll_rad, own.pitch_rad, own.yaw_rad, own.rate_b_rads, "OWN", own.epoch, False)
+        frame = body_from_earth(own.roll_rad, own.pitch_rad, own.yaw_rad)
+        return MotionState(own.roll_rad, own.pitch_rad, own.yaw_rad, own.rate_b_rads, "OWN", own.epoch, False, frame)
 
 
 class _OwnTilt:

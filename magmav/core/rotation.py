@@ -77,3 +77,27 @@ def tilt_from_force(force_b: NDArray[np.float64]) -> tuple[float, float] | None:
 def tilt_angle(roll_rad: float, pitch_rad: float) -> float:
     """Angle between body down and earth down, rad."""
     return math.acos(max(-1.0, min(1.0, math.cos(roll_rad) * math.cos(pitch_rad))))
+
+
+def rotation(turn_rad: NDArray[np.float64]) -> Mat3:
+    """Rotation by the vector ``turn_rad`` (3,), (3, 3), Rodrigues' formula; exact to rounding at any size."""
+    x, y, z = turn_rad.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-9:
+        return np.eye(3)
+    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    out: Mat3 = np.eye(3) + first * cross + second * (cross @ cross)
+    return out
+
+
+def shortest_turn(one: NDArray[np.float64], other: NDArray[np.float64]) -> Mat3:
+    """The smallest rotation that takes the unit vector ``one`` to ``other``, (3, 3); none where they are opposite."""
+    (ax, ay, az), (bx, by, bz) = one.tolist(), other.tolist()
+    c = ax * bx + ay * by + az * bz
+    if c < -0.999:
+        return np.eye(3)
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    out: Mat3 = np.eye(3) + cross + cross @ cross / (1.0 + c)
+    return out

@@ -247,6 +247,7 @@ class Sample:
     learn: bool  # False on time that teaches nothing: on the ground, settling after a parameter change
     axes: int = 3  # 2: a two-axis compass; the z of mag_b_mg means nothing, and the matrix does not mix it in
     model_mg: tuple[float, float] | None = None  # the world model's field here, horizontal and down; None: no position
+    body_from_own: Mat3 | None = None  # from a frame level with the earth that the gyro carries along; None: make it
     throttle: float | None = None  # share of full, 0 to 1; None where nobody says
 
 

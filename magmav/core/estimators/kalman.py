@@ -26,7 +26,7 @@ from filterpy.kalman import predict, update
 from numpy.typing import NDArray
 
 from magmav.core.field import ExpectedField
-from magmav.core.rotation import level_from_body
+from magmav.core.rotation import level_from_body, rotation
 from magmav.core.types import Estimate, Mat3, Sample, vec3
 
 Array = NDArray[np.float64]
@@ -288,15 +288,3 @@ def measurement(
     fx, fy, fz = field_b
     H[:, _T] = (wy * fz - wz * fy, wz * fx - wx * fz, wx * fy - wy * fx)
     return A @ iron_b_mg + field_b, H
-
-
-def rotation(turn_rad: Array) -> Array:
-    """Rotation by the vector ``turn_rad`` (3,), (3, 3), Rodrigues' formula; exact to rounding at any size."""
-    x, y, z = turn_rad
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle < 1e-9:
-        return _EYE3
-    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-    out: Array = _EYE3 + first * cross + second * (cross @ cross)
-    return out

@@ -55,12 +55,15 @@ class AdaptiveEstimator:
         """Learn from one sample, or carry time forward."""
         n = self.tuning
         self._own_yaw_rad += s.yaw_step_rad
-        body_from_own = orientation(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
+        body_from_own = s.body_from_own
+        if body_from_own is None:
+            body_from_own = orientation(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
         dt = max(s.dt_s, 0.0)
         self._idle_s += dt
         self._idle_down += dt * body_from_own[:, 2]
         walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
-        self._idle_turn_rad2 += walk**2 * dt + (n.turn_scale * s.yaw_step_rad) ** 2
+        about_down = float(s.rate_b_rads @ body_from_own[:, 2]) * dt
+        self._idle_turn_rad2 += walk**2 * dt + (n.turn_scale * about_down) ** 2
         self._lost = self._lost or s.gap
         if not s.learn:
             return
