@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magmav.core.causes_blocks import AMPERE, ONE, Block, Blocks
+from magmav.core.causes_blocks import AMPERE, ONE, Block, Blocks, field_of_sample
 from magmav.core.causes_fit import (
     DRIFT,
     GAIN,
@@ -112,7 +112,7 @@ class Causes:
             return
         w = self._watched.setdefault(s.compass, _Watched())
         w.expected = expected
-        self._strange(w, used_b_mg)
+        self._strange(w, s, used_b_mg)
         self._changes(w, e)
         power = (self._ampere or 0.0, self._share or 0.0)
         w.blocks.step(s, min(max(e.delay_s, -0.2), 0.2), power, w.era, grounded)
@@ -151,9 +151,11 @@ class Causes:
 
     # ------------------------------------------------------------ at once
 
-    def _strange(self, w: _Watched, used_b_mg: Vec3) -> None:
+    def _strange(self, w: _Watched, s: Sample, used_b_mg: Vec3) -> None:
+        """Both as the autopilot uses it and, once the iron is known, without it."""
         strength = math.hypot(*used_b_mg)
-        w.strange = 0 if EARTH_MG[0] <= strength <= EARTH_MG[1] else w.strange + 1
+        known = w.fitted is not None and _earthlike(math.hypot(*(field_of_sample(s) - w.fitted.iron_b_mg)))
+        w.strange = 0 if known or _earthlike(strength) else w.strange + 1
         if w.strange >= _STRANGE_SAMPLES:
             text = f"field of {strength:.0f} mG, the Earth's is 150 to 950 mG: magnet or steel near compass"
             w.magnet = Cause("MAGNET_NEARBY", text, {"field_mg": strength})
@@ -198,6 +200,10 @@ class Causes:
             figure = {"compass": float(other), "misfit_mg": mg, "own_misfit_mg": own}
             out.append(Cause("OTHER_COMPASS_BAD", text, figure))
         return tuple(out)
+
+
+def _earthlike(strength_mg: float) -> bool:
+    return EARTH_MG[0] <= strength_mg <= EARTH_MG[1]
 
 
 def _since_the_last_change(blocks: list[Block]) -> tuple[list[Block], int | None]:
