@@ -44,7 +44,7 @@ _LOST_RADS = math.radians(1.5)  # a gyro worse than this, on all axes, bends tur
 _POWER_MG = 8.0  # over two standard deviations of the power that was drawn
 _POWER_CHI2 = 40.0
 _GROUND_MG, _AZIMUTH_RAD = 40.0, math.radians(4.0)
-_JUMP_MG, _JUMP_CHI2 = 30.0, 50.0
+_JUMP_MG, _JUMP_CHI2, _JUMP_FLOOR_MG = 30.0, 50.0, 2.0
 _BAD_MG, _BAD_TIMES = 15.0, 2.5
 _FIT_AT = (3, 6, 12, 24)  # blocks; later every 15
 
@@ -227,7 +227,7 @@ def _changed(f: Fit) -> Cause | None:
     size = float(np.linalg.norm(moved))
     if size < _JUMP_MG or float(moved @ np.linalg.solve(spread, moved)) < _JUMP_CHI2:
         return None
-    sigma = math.sqrt(float(moved @ spread @ moved)) / size
+    sigma = math.hypot(math.sqrt(float(moved @ spread @ moved)) / size, _JUMP_FLOOR_MG)
     text = f"iron on board changed suddenly by {size:.0f} +- {sigma:.0f} mG: something was moved or attached"
     return Cause("IRON_CHANGED", text, {"change_mg": size, "sigma_mg": sigma})
 
