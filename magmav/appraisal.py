@@ -179,12 +179,15 @@ def scores(
 def smoothed_scores(log: CompassLog, reference: Reference | None) -> Result | None:
     """The heading of every sample as measured, as smoothed for the wire, and smoothed after the flight (RTS).
 
-    Magnetic headings with the declination of their sample; None where there is nothing to compare with.
+    Samples before the declination is known do not count, unless it never is. None where there is nothing to compare
+    with.
     """
     if reference is None:
         return None
     boot_s, measured, noise = (np.array(c) for c in (log.boot_s, log.magnetic_rad, log.noise_rad))
-    declination = np.nan_to_num(np.array(log.declination_rad))
+    declination = np.array(log.declination_rad)
+    if not np.isfinite(declination).any():  # then magnetic is compared with magnetic, as in scores()
+        declination = np.zeros(len(log))
     known = np.isfinite(measured)
     after = np.full(len(boot_s), math.nan)
     after[known] = [s.heading_rad for s in smooth(boot_s[known], measured[known], noise[known])]

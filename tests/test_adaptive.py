@@ -12,12 +12,13 @@ from honest_flight import EXPECTED, MOTIONS, samples
 from synthetic_flight import HARD_IRON_MG
 
 from magmav.core.estimators import ESTIMATORS
-from magmav.core.estimators.adaptive import AdaptiveEstimator, orientation, without_prior
+from magmav.core.estimators.adaptive import AdaptiveEstimator, without_prior
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.bank import Bank, field_covariance
 from magmav.core.estimators.adaptive.measurement import Equation, noise
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.rotation import body_from_earth
 from magmav.core.types import vec3
 
 HERE = (EXPECTED.horizontal_mg, EXPECTED.down_mg)
@@ -45,7 +46,7 @@ def states(seed, k=4):
         x[:, part] = rng.normal(0, size, (k, 3))
     x[:, at.T], x[:, at.KAPPA] = rng.normal(0, 0.03, k), rng.normal(0, 0.02, k)
     matrix = np.eye(3) + rng.normal(0, 0.05, (3, 3))
-    body = orientation(*rng.uniform(-1.2, 1.2, 3))
+    body = body_from_earth(*rng.uniform(-1.2, 1.2, 3))
     return x, body, matrix, rng.normal(0, 0.5, 3)
 
 
@@ -102,7 +103,7 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(monkeyp
     equation, yaw = Equation(1), 0.0
     for s in flight[1:]:
         yaw += s.yaw_step_rad
-        body = orientation(s.roll_rad, s.pitch_rad, yaw)
+        body = body_from_earth(s.roll_rad, s.pitch_rad, yaw)
         x, p = theirs.x[None].copy(), theirs.P[None].copy()
         about_down = float(s.rate_b_rads @ body[:, 2]) * s.dt_s
         turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * about_down) ** 2

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.rotation import cross_matrix
 from magmav.core.types import Mat3, Vec3
 
 Array = NDArray[np.float64]
@@ -181,7 +182,7 @@ def row_jacobian(q: Quaternion, v: Vec3) -> Array:
     x, y, z = v.tolist()
     out = np.empty((3, 4))
     out[:, 0] = 2.0 * (w * v + cross(r, v))
-    skew = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    skew = cross_matrix(x, y, z)
     out[:, 1:] = 2.0 * (float(r @ v) * _EYE3 + r[:, None] * v - v[:, None] * r - w * skew)
     return out
 

@@ -15,6 +15,7 @@ import numpy as np
 from magmav.core.marg_attitude import Carried, MargAttitude
 from magmav.core.rotation import (
     body_from_earth,
+    cross_matrix,
     euler_rates,
     level_from_body,
     rotation,
@@ -188,7 +189,7 @@ class _OwnTilt:
             roll, pitch = self._tilt()
             self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self.rate_b_rads + r.rate_b_rads))[2] * dt
             x, y, z = 0.5 * (self.rate_b_rads + r.rate_b_rads) * dt
-            moved = self._down_b - np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._down_b
+            moved = self._down_b - cross_matrix(x, y, z) @ self._down_b
             trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
             moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
             self._down_b = moved / np.linalg.norm(moved)

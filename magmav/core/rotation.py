@@ -79,13 +79,18 @@ def tilt_angle(roll_rad: float, pitch_rad: float) -> float:
     return math.acos(max(-1.0, min(1.0, math.cos(roll_rad) * math.cos(pitch_rad))))
 
 
+def cross_matrix(x: float, y: float, z: float) -> Mat3:
+    """[v x], (3, 3): its product with u is v x u."""
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
 def rotation(turn_rad: NDArray[np.float64]) -> Mat3:
     """Rotation by the vector ``turn_rad`` (3,), (3, 3), Rodrigues' formula; exact to rounding at any size."""
     x, y, z = turn_rad.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-9:
         return np.eye(3)
-    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    cross = cross_matrix(x, y, z)
     first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
     out: Mat3 = np.eye(3) + first * cross + second * (cross @ cross)
     return out
@@ -98,6 +103,6 @@ def shortest_turn(one: NDArray[np.float64], other: NDArray[np.float64]) -> Mat3:
     if c < -0.999:
         return np.eye(3)
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    cross = cross_matrix(x, y, z)
     out: Mat3 = np.eye(3) + cross + cross @ cross / (1.0 + c)
     return out

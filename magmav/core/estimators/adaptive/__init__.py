@@ -22,7 +22,7 @@ from magmav.core.estimators.adaptive.measurement import Equation, noise, soft_ma
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.field import ExpectedField
-from magmav.core.rotation import level_from_body
+from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
@@ -57,7 +57,7 @@ class AdaptiveEstimator:
         self._own_yaw_rad += s.yaw_step_rad
         body_from_own = s.body_from_own
         if body_from_own is None:
-            body_from_own = orientation(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
+            body_from_own = body_from_earth(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
         dt = max(s.dt_s, 0.0)
         self._idle_s += dt
         self._idle_down += dt * body_from_own[:, 2]
@@ -221,11 +221,4 @@ def without_prior(covariance: Array, h_mg: float, v_mg: float, n: Tuning) -> Arr
         left = left + (1e-3 - least) * np.eye(2)
     columns = covariance[:, at.H : at.V + 1]
     out: Array = covariance + columns @ np.linalg.solve(left, columns.T)
-    return out
-
-
-def orientation(roll_rad: float, pitch_rad: float, own_yaw_rad: float) -> Array:
-    """R_bo (3, 3): own frame to body axes."""
-    c, s = math.cos(own_yaw_rad), math.sin(own_yaw_rad)
-    out: Array = level_from_body(roll_rad, pitch_rad).T @ np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
     return out

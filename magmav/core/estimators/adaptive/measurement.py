@@ -12,6 +12,7 @@ import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.layout import Array
+from magmav.core.rotation import cross_matrix
 
 _EYE3 = np.eye(3)
 _PLACES = np.array((0, 3, 4, 3, 1, 5, 4, 5, 2))  # where each entry of S stands among the six
@@ -21,12 +22,6 @@ def soft_matrix(s: Array) -> Array:
     """S, (..., 3, 3), of its six numbers (..., 6)."""
     out: Array = s[..., _PLACES].reshape(*s.shape[:-1], 3, 3)
     return out
-
-
-def skew(v: Array) -> Array:
-    """The matrix [v x] whose product with u is v x u, (3, 3)."""
-    x, y, z = v.tolist()
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 class Equation:
@@ -57,8 +52,8 @@ class Equation:
         down = body_from_own[:, 2]
         h = x[:, at.H, None]
         u = h * ahead + x[:, at.V, None] * down
-        tilt = skew(np.array((-down[1], down[0], 0.0)))
-        late, leaning = u @ skew(rate_b).T, u @ tilt.T
+        tilt = cross_matrix(-down[1], down[0], 0.0)
+        late, leaning = u @ cross_matrix(*rate_b.tolist()).T, u @ tilt.T
         ux, uy, uz = u.T
         e0, s0 = at.E.start, at.S.start
         j[:, 0, e0 + 1], j[:, 0, e0 + 2] = uz, -uy
