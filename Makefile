@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 UV_VERSION := 0.13.9
 export UV_PROJECT_ENVIRONMENT := $(CURDIR)/$(VENV)
 
-.PHONY: demo test check soak bench papers estimators clean
+.PHONY: demo test check soak bench papers estimators real cost clean
 
 $(VENV)/.ready: pyproject.toml uv.lock
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
@@ -41,6 +41,13 @@ papers: $(VENV)/.ready
 
 estimators: $(VENV)/.ready
 	$(BIN)/python benchmarks/estimators.py
+
+# Wants the real recordings and says so (exit 3) where there are none.
+real: $(VENV)/.ready
+	$(BIN)/python benchmarks/real_flights.py || test $$? -eq 3
+
+cost: $(VENV)/.ready
+	$(BIN)/python benchmarks/estimator_cost.py
 
 clean:
 	rm -rf $(VENV) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
