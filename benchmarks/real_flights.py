@@ -99,8 +99,7 @@ def missed(kept: list[HeldOut], judged: list[Ready], rows: list[MagnetRow]) -> l
         if tables.held_out_late(r)
     ]
     for j in judged:
-        why = tables.ready_missed(j)
-        out += [] if why is None else [f"{j.estimator}: {j.file} compass {j.compass}: {why}"]
+        out += [f"{j.estimator}: {j.file} compass {j.compass}: {why}" for why in tables.ready_missed(j)]
     for m in rows:
         out += [f"{m.estimator}: {m.file}, {m.way}: {why}" for why in tables.magnet_missed(m)]
     return out

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,7 +131,11 @@ class Trial:
     tapes: dict[str, Tape]
 
 
-def trials(folder: Path = DATA / "flights", names: tuple[str, ...] = (UNDISTURBED, *MAGNETS)) -> Iterator[Trial]:
+def trials(
+    folder: Path = DATA / "flights",
+    names: Sequence[str] = (UNDISTURBED, *MAGNETS),
+    ways: Sequence[str] = WAYS,
+) -> Iterator[Trial]:
     """Those of the names that are there; none without the undisturbed one, whose field all others need."""
     files = {n: (folder / f"{n}_imu.tlog", folder / f"{n}_truth.csv") for n in {UNDISTURBED, *names}}
     if not all(f.is_file() for f in files[UNDISTURBED]):
@@ -143,7 +147,7 @@ def trials(folder: Path = DATA / "flights", names: tuple[str, ...] = (UNDISTURBE
             continue
         moved = undisturbed if name == UNDISTURBED else read(*files[name])
         known = truth(moved, here, name in MAGNETS)
-        yield Trial(name, known, {way: _tape(files[name][0], moved, way) for way in WAYS})
+        yield Trial(name, known, {way: _tape(files[name][0], moved, way) for way in ways})
 
 
 def _tape(path: Path, moved: Moved, way: str) -> Tape:

@@ -13,13 +13,13 @@ from __future__ import annotations
 import csv
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from magmav.core.rotation import body_from_earth, rotation
 from magmav.core.types import InertialReading, MagReading
@@ -137,26 +137,24 @@ def _carried(boot_s: Floats, rate_b_rads: Floats, truth_csv: Path) -> tuple[Floa
         rows = np.array([[float(r[k]) for k in ("boot_time_s", "roll_deg", "pitch_deg", "heading_true_deg")]
                          for r in csv.DictReader(file)])  # fmt: skip
     seen = [body_from_earth(*np.radians(row[1:])) for row in rows]
+    row_rates = np.stack([np.interp(rows[:, 0], boot_s, rate_b_rads[:, axis]) for axis in range(3)], axis=1)
+    latest = np.searchsorted(rows[:, 0], boot_s, side="right") - 1
     out = np.broadcast_to(np.eye(3), (len(boot_s), 3, 3)).copy()
-    valid = np.zeros(len(boot_s), dtype=bool)
-    for i, now in enumerate(boot_s):
-        k = int(np.searchsorted(rows[:, 0], now, side="right")) - 1
-        if k < 0 or now - rows[k, 0] > _ROW_S:
-            continue
-        begin = float(rows[k, 0])
-        inside = boot_s[(boot_s > begin) & (boot_s < now)] if now > begin else []
-        grid = [begin, *inside, float(now)]
-        carried = seen[k]
-        for a, b in pairwise(grid):
-            middle = [np.interp(0.5 * (a + b), boot_s, rate_b_rads[:, axis]) for axis in range(3)]
-            carried = rotation(-(b - a) * np.array(middle)) @ carried
-        out[i], valid[i] = carried, True
+    valid = (latest >= 0) & (boot_s - rows[latest, 0] <= _ROW_S)
+    for i in np.flatnonzero(valid):
+        k = latest[i]
+        on = i > 0 and valid[i - 1] and latest[i - 1] == k  # from the sample before, or from the row itself
+        begin_s, rate, attitude = (
+            (boot_s[i - 1], rate_b_rads[i - 1], out[i - 1]) if on else (rows[k, 0], row_rates[k], seen[k])
+        )
+        out[i] = rotation(-(boot_s[i] - begin_s) * 0.5 * (rate + rate_b_rads[i])) @ attitude
     return out, valid
 
 
 def lagged(m: Moved, lag_s: float) -> Floats:
     """Attitude at the times the magnetometer means, (N, 3, 3)."""
-    return np.array([rotation(lag_s * w) @ r for w, r in zip(m.rate_b_rads, m.body_from_room, strict=True)])
+    turned: Floats = Rotation.from_rotvec(lag_s * m.rate_b_rads).as_matrix() @ m.body_from_room
+    return turned
 
 
 def room(undisturbed: Moved) -> Room:

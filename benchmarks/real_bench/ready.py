@@ -22,6 +22,7 @@ class Ready:
 
     after_s : seconds of flying until the first READY.  share : of flying seconds spent READY.
     ready_s, wrong_s : seconds READY while flying with enough of the flight left to judge by, and those of them wrong.
+    offsets_wrong_s : those where the offsets alone, which is what an upload writes, are wrong by the same rule.
     why_not : how many flying seconds each reason stood against it.
     """
 
@@ -39,6 +40,7 @@ class Ready:
     wrong: bool | None
     ready_s: float
     wrong_s: float
+    offsets_wrong_s: float
     why_not: dict[str, float]
 
 
@@ -55,7 +57,7 @@ def ready(judge: Judge, estimator: str, moments: list[Moment]) -> Ready:
             why_not[reason] = why_not.get(reason, 0.0) + dt
     said = [m for m, yes in zip(flying, is_ready, strict=True) if yes]
     best = judge.best(0.0)
-    judged: list[tuple[Moment, float, float | None, float | None, float | None, bool]] = []
+    judged: list[tuple[Moment, float, float | None, float | None, float | None, bool, bool]] = []
     for m in said:
         frozen_s = m.boot_s - tape.started_s
         if judged and m.boot_s - judged[-1][0].boot_s < 5.0:
@@ -64,8 +66,8 @@ def ready(judge: Judge, estimator: str, moments: list[Moment]) -> Ready:
             break
         full, offsets, _ = judge.score(frozen_s, m.estimate, offsets_to_store(tape, judge.compass, m.estimate))
         sigma = judge.sigma_deg(frozen_s, m.estimate)
-        wrong = full is not None and full > 3.0 * math.hypot(sigma or 0.0, best or 0.0)
-        judged.append((m, frozen_s, full, offsets, sigma, wrong))
+        most = 3.0 * math.hypot(sigma or 0.0, best or 0.0)
+        judged.append((m, frozen_s, full, offsets, sigma, (full or 0.0) > most, (offsets or 0.0) > most))
     first = judged[0] if judged else None
     return Ready(
         file=tape.name,
@@ -82,5 +84,6 @@ def ready(judge: Judge, estimator: str, moments: list[Moment]) -> Ready:
         wrong=first[5] if first else None,
         ready_s=5.0 * len(judged),
         wrong_s=5.0 * sum(j[5] for j in judged),
+        offsets_wrong_s=5.0 * sum(j[6] for j in judged),
         why_not=dict(sorted(why_not.items(), key=lambda kv: -kv[1])),
     )

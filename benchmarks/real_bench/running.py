@@ -18,7 +18,7 @@ from magmav.core.correction import iron_of_offsets
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.types import ZERO3, AxisState, CurrentReading, Estimate, State, ThrottleReading, Vec3
 from magmav.vehicle import limits
-from real_bench.tapes import Tape
+from real_bench.tapes import Heard, Tape
 
 Make = Callable[[], Estimator]
 
@@ -104,7 +104,7 @@ def before(moments: list[Moment], boot_s: float) -> Moment | None:
 
 def offsets_to_store(tape: Tape, compass: int, e: Estimate) -> Vec3:
     """What a replay frozen at this estimate calls the compass's offsets at its end, (3,) mG, to be added."""
-    *_, end = tape.heard(compass)
+    end = next(h for h in reversed(tape.events) if isinstance(h, Heard) and h.sample.compass == compass)
     offsets = -iron_of_offsets(end.sample, e, end.circumstances.expected)
     sigma = gate.floored(e, SIGMA_FLOOR_MG)
     axes = gate.axis_states(e.own_sigma_mg, sigma, limits(tape.settings).axis_sigma_mg)

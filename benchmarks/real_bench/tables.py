@@ -70,21 +70,26 @@ def ready_table(rows: list[Ready]) -> str:
         ]
         lines.append(cells)
     head = ["recording, compass", "estimator", "flown s", "READY after s", "READY", "RMS", "offsets only", "sigma"]
-    return table([*head, "r rest", "r all", "then", "wrong s", "s against it"], lines)
+    return table([*head, "r rest", "r all", "then", "wrong s: full / offsets", "s against it"], lines)
 
 
-def ready_missed(r: Ready) -> str | None:
-    """What the project demands and this is not; None where all is well."""
-    if r.wrong or r.wrong_s:
-        return f"READY while wrong ({r.wrong_s:.0f} s)"
-    if r.file == "thor75.tlog" and (r.after_s is None or r.after_s > 120.0):
-        return f"READY after {num(r.after_s, 0)} s, want 120"
-    demanded = r.file == "thor75.tlog" or (r.file == "log171.bin" and r.compass in (1, 2))
-    if demanded and r.after_s is None:
-        return "never READY"
-    if demanded and (r.full_deg is None or r.full_deg > 5.0):
-        return f"{num(r.full_deg)} degrees when READY, want 5"
-    return None
+def ready_missed(r: Ready) -> list[str]:
+    """What the project demands and this is not."""
+    out = []
+    if r.wrong_s:
+        out.append(f"READY while wrong ({r.wrong_s:.0f} of {r.ready_s:.0f} s)")
+    if r.offsets_wrong_s:
+        out.append(f"READY while the offsets alone are wrong ({r.offsets_wrong_s:.0f} of {r.ready_s:.0f} s)")
+    thor = r.file == "thor75.tlog"
+    if not thor and (r.file != "log171.bin" or r.compass not in (1, 2)):
+        return out
+    if r.after_s is None:
+        return [*out, "never READY"]
+    if thor and r.after_s > 120.0:
+        out.append(f"READY after {r.after_s:.0f} s, want 120")
+    if r.full_deg is None or r.full_deg > 5.0:
+        out.append(f"{num(r.full_deg)} degrees when first READY, want 5")
+    return out
 
 
 def magnet_table(rows: list[MagnetRow]) -> str:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from magmav.appraisal import CompassLog
 from magmav.core.channel import Circumstances
-from magmav.core.types import CurrentReading, Reading, Record, Sample, ThrottleReading, Vec3
+from magmav.core.estimators import ESTIMATORS
+from magmav.core.field import ExpectedField
+from magmav.core.types import CurrentReading, Estimate, Reading, Record, Sample, ThrottleReading, Vec3
 from magmav.geomag import world_magnetic_model
 from magmav.logs import Recording
 from magmav.pipeline import Pipeline
@@ -71,10 +74,30 @@ def recordings(folder: Path = DATA) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.suffix in (".tlog", ".bin", ".ulg"))
 
 
+class _Idle:
+    """Learns nothing, at no cost. Satisfies Estimator."""
+
+    def step(self, sample: Sample) -> None:
+        """Nothing."""
+
+    def estimate(self, expected: ExpectedField | None) -> Estimate | None:
+        """Nothing."""
+        return None
+
+
+@contextmanager
+def _nobody_learns(settings: Settings) -> Iterator[Settings]:
+    """The same settings with an estimator that does nothing: Samples do not depend on what is learnt from them."""
+    ESTIMATORS["idle"] = _Idle
+    try:
+        yield with_value(settings, "learn", "estimator", "idle")
+    finally:
+        del ESTIMATORS["idle"]
+
+
 def tapes(recording: Recording, name: str, settings: Settings | None = None) -> list[Tape]:
     """One tape per vehicle that was heard."""
     settings = settings or Settings()
-    cheapest = with_value(settings, "learn", "estimator", "minmax")  # Samples do not depend on it
     events: dict[int, list[Event]] = {}
     tapped: list[tuple[Sample, Circumstances, tuple[int, int]]] = []
 
@@ -87,9 +110,10 @@ def tapes(recording: Recording, name: str, settings: Settings | None = None) -> 
         elif tapped and record is not None:
             events.setdefault(reading.system, []).append(Heard(*tapped.pop(), record.stored_b_mg))
 
-    pipeline = Pipeline(cheapest, world_magnetic_model, recording.unix_offset_ns, tap)
-    keeper = Keeper(pipeline, None)
-    play(recording, pipeline, [keeper, keep])
+    with _nobody_learns(settings) as idle:
+        pipeline = Pipeline(idle, world_magnetic_model, recording.unix_offset_ns, tap)
+        keeper = Keeper(pipeline, None)
+        play(recording, pipeline, [keeper, keep])
     earlier = keeper.bring_back()
     out = []
     for system in sorted({s for s, _ in keeper.compasses}):
