@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import Heading, Record, Shaping, State, Vec3
+from magmav.core.types import ZERO3, Heading, Record, Shaping, State, Vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -116,6 +117,7 @@ def describe(
         "state": last.verdict.state.name,
         "reasons": [{"code": r.name, "text": r.text} for r in last.verdict.reasons],
         "causes": [cause.as_json() for cause in vehicle.causes.of(compass)],
+        "deviation_card": _card(last, vehicle) if known else None,
         "heading": full,
         "heading_offsets_only": offsets_only,
         "heading_smoothed": smoothed_scores(log, reference) if smoothing != "off" else None,
@@ -124,6 +126,28 @@ def describe(
         "samples": len(log),
         "samples_learnt": log.learnt,
     }
+
+
+def _card(last: Record, vehicle: Vehicle | Boot) -> list[Result]:
+    """Eight headings, N to NW: heading error in degrees with its sigma, as stored, with new offsets, with the model."""
+    e, held = last.estimate, vehicle.calibrations
+    stored = held.offsets(last.compass)
+    floors = np.maximum(last.sigma_mg**2 - np.diag(e.covariance_mg2), 0.0)
+    card = deviation_card(
+        e,
+        e.covariance_mg2 + np.diag(floors),
+        held.shaping(last.compass).matrix,
+        ZERO3 if stored is None else stored,
+        last.offsets_mg,
+    )
+    rows: list[Result] = []
+    for d in card:
+        row: Result = {"heading": d.name, "heading_deg": round(math.degrees(d.heading_rad), 1)}
+        for name, error in (("before", d.before), ("after", d.after), ("full", d.full)):
+            row[f"{name}_deg"] = None if error is None else round(math.degrees(error.error_rad), 3) + 0.0
+            row[f"{name}_sigma_deg"] = None if error is None else round(math.degrees(error.sigma_rad), 3)
+        rows.append(row)
+    return rows
 
 
 def _known(vector: Vec3, last: Record) -> list[float | None]:

@@ -42,7 +42,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"magmav {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
-    def add(name: str, text: str, *, place: bool = False, store: bool = False) -> argparse.ArgumentParser:
+    def add(
+        name: str, text: str, *, place: bool = False, store: bool = False, bench: bool = False
+    ) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
         sub.add_argument("--json", action="store_true", help="JSON on standard output")
         sub.add_argument("-v", "--verbose", action="store_true", help="more on standard error")
@@ -52,6 +54,9 @@ def parser() -> argparse.ArgumentParser:
             sub.add_argument("--lat", type=float, metavar="DEG", help="latitude, for vehicles without GPS")
             sub.add_argument("--lon", type=float, metavar="DEG", help="longitude")
             sub.add_argument("--alt", type=float, metavar="M", help="altitude above mean sea level")
+        if bench:
+            why = "turned by hand, away from steel: what flies may be ready before it has flown"
+            sub.add_argument("--bench", action="store_true", help=why)
         if store:
             sub.add_argument("--store", type=Path, metavar="FILE", help="history and undo (default: user state)")
         return sub
@@ -61,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--seed", type=int, metavar="N", help="another wind, other noise")
     demo.add_argument("--plot", type=Path, metavar="PNG", help="where to draw the picture")
 
-    run = add("run", f"the service on a live link ({_LINKS})", place=True, store=True)
+    run = add("run", f"the service on a live link ({_LINKS})", place=True, store=True, bench=True)
     _link(run)
     run.add_argument("--record", type=Path, metavar="TLOG", help="record the link, both ways")
     run.add_argument("--records", type=Path, metavar="FILE", help="every Record, .jsonl or .csv")
@@ -71,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
     sim = commands.add_parser("sim", help="a simulated vehicle for any ground station or companion", add_help=False)
     sim.add_argument("rest", nargs=argparse.REMAINDER)
 
-    replay = add("replay", "a recording through the same pipeline: what would have been known", place=True)
+    replay = add("replay", "a recording through the same pipeline: what would have been known", place=True, bench=True)
     replay.add_argument("log", type=Path, metavar="LOG", help="a .tlog, .bin, .log or .ulg")
     replay.add_argument(
         "--learn-for", type=float, metavar="S", help="freeze S seconds after take-off and score the rest"

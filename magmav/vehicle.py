@@ -17,6 +17,7 @@ from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.correction import without_third
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.field import ExpectedField, FieldKeeper
+from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
 from magmav.core.published import Publisher, noise_of_heading
@@ -26,6 +27,7 @@ from magmav.core.types import (
     AttitudeReading,
     AxisState,
     CurrentReading,
+    Estimate,
     FieldModel,
     Heading,
     InertialReading,
@@ -58,7 +60,7 @@ _ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 
 
 Tap = Callable[[Sample, Circumstances, tuple[int, int]], None]
-"""Sees every Sample with its circumstances, and the number of boots and of foreign parameter changes before it."""
+"""Sees every Sample with its circumstances, and the number of boots and of new beginnings of its compass before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,7 @@ class Vehicle:
         self._unix_minus_boot_ns: int | None = None
         self._epochs: dict[int, int] = {}
         self._settle_until_ns: dict[int, int] = {}
+        self._handovers: dict[int, Handover] = {}
         self._latest: dict[int, Record] = {}
         self._publishers: dict[int, Publisher] = {}
         self._first_ns: int | None = None
@@ -134,10 +137,7 @@ class Vehicle:
             case LandedReading():
                 self.phase.landed(r)
             case ParamReading():
-                for book in self._books.values():
-                    changed = book.param(r)
-                    for compass in changed if book is self.calibrations else ():
-                        self.settle(compass)
+                self._param(r)
             case ThrottleReading():
                 self._throttle = r.share
                 self.calibrations.throttle(r.share)
@@ -149,6 +149,21 @@ class Vehicle:
                 self._unix_minus_boot_ns = r.unix_ns - r.boot_ns
         self._after_reboot()
         return None
+
+    def _param(self, r: ParamReading) -> None:
+        """Where a correction changes, what comes next teaches nothing; new offsets for old are handed over exactly."""
+        held, now_ns = self.calibrations, self._now_ns()
+        before = {c: (held.epoch(c), held.offsets(c)) for c in self.channels}
+        changed: tuple[int, ...] = ()
+        for book in self._books.values():
+            its = book.param(r)
+            changed = its if book is held else changed
+        for compass in changed:
+            self.settle(compass)
+            epoch, old = before.get(compass, (None, None))
+            new = held.offsets(compass)
+            if epoch == held.epoch(compass) and old is not None and new is not None:
+                self._handovers.setdefault(compass, Handover()).changed(old, new, now_ns)
 
     def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
         held, compass, axes = self.calibrations, r.compass, self.settings.compass.axes
@@ -162,6 +177,7 @@ class Vehicle:
             self.assembler.restart(compass)
             channel.restart()
             self.causes.restart(compass)
+            self._handovers.pop(compass, None)
         if not held.undoable(compass):
             self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
             return None
@@ -180,12 +196,13 @@ class Vehicle:
         self._after_reboot()
         if sample is None:
             return self._frozen(r, t_ns, channel)
+        sample = self._handed_over(self._handled(sample, channel.held), channel.estimate)
         circumstances = self._circumstances(compass, unix_ns)
         if self._tap is not None:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
-        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, circumstances.grounded)
+        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self._unflown())
         finding = self._doubted(finding, self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
@@ -213,6 +230,19 @@ class Vehicle:
             published_boot_ns=published_ns,
         )
         return record
+
+    def _handled(self, s: Sample, held: bool) -> Sample:
+        """What is turned by hand teaches too, and says so."""
+        settled = s.boot_ns >= self._settle_until_ns.get(s.compass, 0)
+        taught = s.learn or (self.phase.handled(s) and settled and not held)
+        if not taught or self.phase.armed or not self.phase.flyer:
+            return s
+        return replace(s, learn=True, by_hand=True)
+
+    def _handed_over(self, s: Sample, e: Estimate) -> Sample:
+        """Undone with the offsets it was made with, while new ones take the place of old ones."""
+        handover = self._handovers.setdefault(s.compass, Handover())
+        return handover.step(s, e, int(self.settings.learn.settle_s * 1e9))
 
     def _publish(self, sample: Sample, finding: Finding) -> tuple[Heading, int]:
         """The heading that goes out, smoothed as the settings say, and the boot time it belongs to."""
@@ -311,6 +341,9 @@ class Vehicle:
             unix_ns = self._unix_minus_boot_ns + self._now_ns()
         return self._keeper.at(*self._place, unix_ns)
 
+    def _unflown(self) -> bool:
+        return self.phase.flyer and self.phase.takeoff_ns is None
+
     def _circumstances(self, compass: int, unix_ns: int) -> Circumstances:
         held = self.calibrations
         return Circumstances(
@@ -318,7 +351,7 @@ class Vehicle:
             relative=not held.known(compass),
             assumed=held.assumed(compass),
             parameters_changed=held.changed(compass),
-            grounded=self.phase.flyer and self.phase.takeoff_ns is None,
+            grounded=self._unflown() and not self.settings.learn.on_ground,
             frozen_s=self.assembler.frozen_s(compass),
         )
 
@@ -336,6 +369,7 @@ class Vehicle:
         self._books = _books()
         self._epochs.clear()
         self._settle_until_ns.clear()
+        self._handovers.clear()
         self._latest.clear()
         self._publishers.clear()
         self._first_ns = self._unix_minus_boot_ns = None

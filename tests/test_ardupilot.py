@@ -147,12 +147,37 @@ def test_the_epoch_grows_only_when_the_correction_of_that_compass_changes():
     assert tell(held, {"COMPASS_MOT_X": 12.0}) == []  # no motor compensation is on
     assert tell(held, {"COMPASS_SCALE": 1.6}) == []  # out of range like 0: no scale either way
     assert (held.epoch(1), held.epoch(2)) == (one, two)
-    assert tell(held, {"COMPASS_OFS_X": 40.0}) == [1]
+    assert tell(held, {"COMPASS_OFS_X": 40.0}) == [1]  # told, but undone exactly: the sensor's own field goes on
+    assert (held.epoch(1), held.epoch(2)) == (one, two)
+    assert tell(held, {"COMPASS_DIA_X": 1.1}) == [1]
     assert (held.epoch(1), held.epoch(2)) == (one + 1, two)
-    assert tell(held, {"COMPASS_OFS_X": 0.0}) == [1]
+    assert tell(held, {"COMPASS_DIA_X": 1.0}) == [1]
     assert held.epoch(1) == one + 2
     assert tell(held, {"COMPASS_MOTCT": 1.0}) == [1, 2, 3]
     assert tell(held, {"COMPASS_MOT_X": 13.0}) == [1]
+    assert held.epoch(1) == one + 4
+
+
+def test_offsets_that_were_not_known_before_begin_a_new_stretch():
+    known = plain(ofs=(5, 6, 7))
+    for unheard in ("COMPASS_OFS_X", "COMPASS_OFS_Y", "COMPASS_OFS_Z"):
+        held = holding({n: v for n, v in known.items() if n != unheard})
+        before = held.epoch(1)
+        assert tell(held, {unheard: known[unheard]}) == [1]
+        assert held.epoch(1) == before + 1
+        assert not held.changed(1)
+
+
+def test_another_device_begins_a_new_stretch_and_the_first_one_does_not():
+    held = holding(plain())
+    before = held.epoch(1)
+    assert tell(held, {"COMPASS_DEV_ID": 97539}) == []
+    assert tell(held, {"COMPASS_DEV_ID": 466441}) == [1]
+    assert (held.epoch(1), held.changed(1)) == (before + 1, True)
+    held = holding({n: v for n, v in plain().items() if "DEV" not in n})
+    before = held.epoch(1)
+    assert tell(held, {"COMPASS_DEV_ID": 97539}) == []
+    assert (held.epoch(1), held.changed(1)) == (before, False)
 
 
 def test_changed_is_said_when_something_known_was_changed_and_not_when_it_is_first_heard():
@@ -163,7 +188,7 @@ def test_changed_is_said_when_something_known_was_changed_and_not_when_it_is_fir
     assert not held.changed(2)
 
 
-def test_our_own_change_starts_no_new_epoch_but_is_undone_at_once():
+def test_our_own_change_is_undone_at_once_and_not_told_of():
     held = holding(plain(ofs=(10, 20, 30)))
     before, names = held.epoch(1), [f"COMPASS_OFS_{a}" for a in AXES]
     held.expect(names, (100.0, -50.0, 5.0))
@@ -173,7 +198,8 @@ def test_our_own_change_starts_no_new_epoch_but_is_undone_at_once():
     assert not held.changed(1)
     assert held.undo(1, SENSOR) == pytest.approx(SENSOR - [100, -50, 5])
     tell(held, {"COMPASS_OFS_X": 101.0})  # somebody else's
-    assert held.epoch(1) == before + 1
+    assert held.epoch(1) == before
+    assert held.changed(1)
 
 
 # ------------------------------------------------------------ absolute, relative, assumed

@@ -2,7 +2,7 @@
 
 Acceptance tests of users.md that other files hold: AT-3b test_excitation (a level turn fills one ring only), AT-3c
 test_coach, AT-12a test_channel (without position magnetic only), AT-12b test_geomag, AT-13b test_score and test_table,
-AT-17a test_upload, AT-17b test_store and test_end_to_end.
+AT-17a and AT-17b test_trust, and for the write itself test_upload, test_store and test_end_to_end.
 """
 
 import math

@@ -123,14 +123,18 @@ def test_a_young_estimate_is_not_accused_of_a_bad_field():
 
 
 def test_nothing_learnt_yet():
-    got = verdict(estimate=None, grounded=True)
     nothing = judge(replace(FINE, estimate=None, grounded=True), LIMITS, State.NO_DATA)
     assert (nothing.state, nothing.reasons) == (State.LEARNING, (Reason.NOT_FLYING,))
     assert nothing.axes == NOTHING.axes == (BLIND, BLIND, BLIND)
     flying = judge(replace(FINE, estimate=None, relative=True, has_attitude=False), LIMITS, State.NO_DATA)
     assert flying.reasons == (Reason.TOO_LITTLE_DATA, Reason.RELATIVE_ONLY, Reason.NO_ATTITUDE)
-    assert got.state is State.READY  # being on the ground again does not undo what was learnt
     assert NOTHING.state is State.NO_DATA
+
+
+def test_what_was_learnt_in_somebodys_hands_alone_is_not_ready():
+    got = verdict(grounded=True)
+    assert (got.state, got.axes, got.reasons) == (State.LEARNING, (SEEN, SEEN, SEEN), (Reason.NOT_FLYING,))
+    assert verdict(grounded=True, was=State.READY).state is State.LEARNING
 
 
 # ------------------------------------------------------------ hysteresis

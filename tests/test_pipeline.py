@@ -65,7 +65,7 @@ def test_parameters_of_one_vehicle_do_not_touch_another():
     assert bench.pipeline.vehicles[2].calibrations.value("COMPASS_OFS_X") == 70.0
 
 
-def test_parameters_changed_and_changed_back_never_mix():
+def test_AT_5c_parameters_changed_and_changed_back_never_mix():
     """As a test pilot does: 100 mG more on x, look at it, take it back. The stream lags the echo by 0.4 s."""
     n, change, back, lag = 60 * HZ, 15 * HZ, 30 * HZ, 10
     offsets = np.zeros((n, 3))
@@ -78,18 +78,15 @@ def test_parameters_changed_and_changed_back_never_mix():
         if ms in at:
             bench.play([tell.param("COMPASS_OFS_X", at.pop(ms))])
         samples += bench.play([(ms, data)])
-    learnt = [r for r in samples if r.learnt]
     wrong = [
-        r for r in learnt if abs(r.mag_b_mg[0] - r.stored_b_mg[0] + offsets[round(r.boot_ns / 4e7) - 250, 0]) > 0.5
+        r for r in samples if abs(r.mag_b_mg[0] - r.stored_b_mg[0] + offsets[round(r.boot_ns / 4e7) - 250, 0]) > 0.5
     ]
-    assert wrong == []  # every value learnt from was undone with the offsets it was sent with
+    assert wrong == []  # every value was undone with the offsets it was sent with, learnt from or not
     for start in (change, back):
-        first = next(r for r in samples if r.boot_ns >= (10_000 + start * 40 + 40) * 10**6)
-        assert first.estimate.samples == 0
-        assert first.verdict.state is not State.READY
-        quiet = [r for r in samples if 0 <= r.boot_ns - (10_000 + start * 40 + 40) * 10**6 < 0.9e9]
-        assert quiet
-        assert not any(r.learnt for r in quiet)
+        at_ns = (10_000 + start * 40) * 10**6
+        assert [r for r in samples if r.learnt and at_ns <= r.boot_ns < at_ns + 1.36e9] == []
+        first = next(r for r in samples if r.boot_ns >= at_ns + 1.5e9)
+        assert first.learnt and first.estimate.samples > 300
     last = samples[-1]
     assert Reason.PARAMETERS_CHANGED in last.verdict.reasons
     assert np.all(np.abs(last.offsets_mg + HARD_IRON_MG) < 4.0 * last.sigma_mg)

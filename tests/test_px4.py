@@ -214,20 +214,30 @@ def test_what_a_release_does_not_have_is_not_assumed():
     assert holding({k: v for k, v in p.items() if "SCALE" not in k}).assumed(1)
 
 
-def test_a_change_in_flight_begins_a_new_stretch_and_one_after_landing_does_not():
+def test_offsets_that_move_are_undone_exactly_and_told_of_in_flight_only():
     held = holding(slot(0, OFF=(0.1, 0.0, 0.0)))
     assert held.epoch(1) == 0
+    assert tell(held, {"CAL_MAG0_YOFF": 0.1}) == [1]  # after a landing PX4 moves them by itself
+    assert (held.epoch(1), held.changed(1)) == (0, False)
     held.armed(True)
     assert tell(held, {"CAL_MAG0_XOFF": 0.2}) == [1]
-    assert (held.epoch(1), held.changed(1)) == (1, True)
+    assert (held.epoch(1), held.changed(1)) == (0, True)
+    assert held.offsets(1) == pytest.approx((-200.0, -100.0, 0.0))
     held.armed(False)
-    assert tell(held, {"CAL_MAG0_YOFF": 0.1}) == [1]
-    assert held.epoch(1) == 1
-    assert held.offsets(1) == pytest.approx((-200.0, -100.0, 0.0))  # undone exactly all the same
     assert tell(held, {"CAL_MAG0_XSCALE": 1.1}) == [1]
-    assert held.epoch(1) == 2
+    assert held.epoch(1) == 1
     assert tell(held, {"CAL_MAG1_XOFF": 0.5, "CAL_MAG_SIDES": 63, "EKF2_MAG_DECL": 2.5, "CAL_MAG0_XSCALE": 1.1}) == []
+    assert held.epoch(1) == 1
+    assert tell(held, {"SENS_BOARD_X_OFF": 3.0}) == [1]  # no offset of a compass: it turns the axes
     assert held.epoch(1) == 2
+
+
+def test_offsets_heard_for_the_first_time_begin_a_new_stretch():
+    p = slot(0, OFF=(0.1, 0.2, 0.3))
+    del p["CAL_MAG0_ZOFF"]
+    held = holding(p)
+    assert tell(held, {"CAL_MAG0_ZOFF": 0.3}) == [1]
+    assert (held.epoch(1), held.changed(1)) == (1, False)
 
 
 def test_our_own_doing_and_another_sensor():

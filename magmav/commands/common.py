@@ -35,6 +35,8 @@ def settings_of(o: argparse.Namespace) -> Settings:
         if value is not None:
             part = msgspec.structs.replace(getattr(settings, section), **{key: value})
             settings = msgspec.structs.replace(settings, **{section: part})
+    if getattr(o, "bench", False):
+        settings = msgspec.structs.replace(settings, learn=msgspec.structs.replace(settings.learn, on_ground=True))
     settings = msgspec.convert(msgspec.to_builtins(settings), Settings)
     return checked(settings, "command line")
 

@@ -90,6 +90,11 @@ class Channel:
         """On hold with an answer: the sensor's own iron does not change with what the autopilot stores."""
         return self.held and self._estimate is not None
 
+    @property
+    def estimate(self) -> Estimate:
+        """What is believed; when nothing is, zero with a sigma as wide as the world."""
+        return self._estimate or _NO_ESTIMATE
+
     def restart(self) -> None:
         """Begin again: what was learnt belongs to another stretch of data."""
         self.verdict = gate.NOTHING
@@ -144,7 +149,7 @@ class Channel:
         """Ask the estimator and judge its answer; a few times a second is often enough."""
         if not self.held and (s.learn or self._estimate is None):
             self._estimate = self._estimator.estimate(c.expected)
-        e = self._estimate or _NO_ESTIMATE
+        e = self.estimate
         if s.learn and self._estimate is not None:
             self._follow(s, e, c.expected)
         sigma = gate.floored(e, SIGMA_FLOOR_MG)

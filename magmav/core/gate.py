@@ -52,7 +52,7 @@ class Evidence:
     relative: bool
     assumed: bool
     parameters_changed: bool
-    grounded: bool  # a flying vehicle that has not flown yet
+    grounded: bool  # a flying vehicle that has not flown yet, and nobody said that the bench will do
     axes: int = 3  # 2: the third component of the field comes from the dip, or is missing without a position
 
 
@@ -123,6 +123,8 @@ def _missing(
 ) -> tuple[Reason, ...]:
     """What more flying, or more knowledge of the vehicle, would bring."""
     out = []
+    if e.grounded:  # what was learnt in somebody's hands is an answer, but nothing to write unless asked (--bench)
+        out.append(Reason.NOT_FLYING)
     if estimate.samples < limits.samples:
         out.append(Reason.TOO_LITTLE_DATA)
     names = (Reason.X_NOT_OBSERVED, Reason.Y_NOT_OBSERVED)

@@ -1,7 +1,8 @@
 """Is the vehicle flying, since when and until when? What stands on steel and concrete teaches nothing about a compass.
 
 The altitude rule is for vehicles that fly. Rovers, boats, and anything that never says what it is, learn wherever
-they are (users.md N1, N11).
+they are (users.md N1, N11). What flies also learns while somebody turns it in his hands, disarmed and before its first
+flight: afterwards it is being carried away, past whatever steel there is, and flight has taught better.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from magmav.core.handling import Handling
 from magmav.core.rotation import tilt_angle
-from magmav.core.types import Landed, LandedReading, MotionReading, PositionReading, VehicleReading
+from magmav.core.types import Landed, LandedReading, MotionReading, PositionReading, Sample, VehicleReading
 
 # MAV_TYPE of what flies: fixed wing, multirotors, helicopters, airships, flapping wing, VTOLs, parafoil, dodecarotor.
 _FLYERS = frozenset({1, 2, 3, 4, 7, 8, 13, 14, 15, 16, 19, 20, 21, 22, 23, 24, 25, 28, 29, 35, 43})
@@ -61,6 +63,7 @@ class Phase:
         self._height_m: float | None = None
         self._speed_mps = 0.0
         self._over_since_ns: int | None = None
+        self._handling = Handling()
 
     @property
     def flyer(self) -> bool:
@@ -153,6 +156,13 @@ class Phase:
             self._over_since_ns = boot_ns
         elif self.flights[-1].crash_ns is None and boot_ns - self._over_since_ns > _CRASH_S * 1e9:
             self.flights[-1].crash_ns = self._over_since_ns
+
+    def handled(self, s: Sample) -> bool:
+        """Is a vehicle that flies, and has not yet, being turned by hand? To be asked for every sample."""
+        if self.armed or not self.flyer or self.takeoff_ns is not None:
+            self._handling = Handling()
+            return False
+        return self._handling.see(s)
 
     @property
     def crash_ns(self) -> int | None:

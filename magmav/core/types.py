@@ -249,6 +249,7 @@ class Sample:
     model_mg: tuple[float, float] | None = None  # the world model's field here, horizontal and down; None: no position
     body_from_own: Mat3 | None = None  # from a frame level with the earth that the gyro carries along; None: make it
     throttle: float | None = None  # share of full, 0 to 1; None where nobody says
+    by_hand: bool = False  # taught while disarmed, of a vehicle that flies: turned in somebody's hands
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from magmav.view.deviation import card_view
+
 Json = Mapping[str, Any]
 
 UNKNOWN = "not known"
@@ -187,7 +189,8 @@ def _compass(compass: Json) -> RenderableType:
     lines += [_para(f"    ! {_word(c.get('text') or c.get('code'))}") for c in compass.get("causes") or []]
     stored = ", ".join(f"{_word(n)} {_number(v, 'g')}" for n, v in (compass.get("stored") or {}).items())
     facts = [_para(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass)]
-    return Group(Text(), *lines, table, *facts)
+    card = card_view(compass.get("deviation_card") or [])
+    return Group(Text(), *lines, table, *facts, *([Text(), card] if compass.get("deviation_card") else []))
 
 
 def _headings(compass: Json) -> list[RenderableType]:

@@ -26,7 +26,7 @@ from magmav.core.types import (
     mat3,
     vec3,
 )
-from magmav.mavlink.autopilot.stored import StoredCalibrations, invertible
+from magmav.mavlink.autopilot.stored import StoredCalibrations, invertible, only_offsets_moved
 
 COMPASSES = (1, 2, 3)
 _AXES = ("X", "Y", "Z")
@@ -69,8 +69,11 @@ def wanted_names(compasses: Iterable[int]) -> tuple[str, ...]:
 class Calibrations:
     """What one ArduPilot vehicle holds for its compasses, as far as it has been heard, and how to undo it.
 
-    ``epoch(compass)`` grows whenever a value that shapes the stream is found to differ from what was used before, so
-    that data before and after are never mixed.
+    ``epoch(compass)`` grows whenever data before and after must not be mixed: another device, a value that was not
+    known before, another scale, matrix or motor term. Offsets that were known before and after are no such thing: both
+    are undone exactly, and the sensor's own field knows neither. The others are not, though they are undone as exactly:
+    an estimate of soft iron or of a share of throttle is one relative to them, and a wrong matrix that is put right has
+    spoilt what was learnt with it.
     """
 
     def __init__(self) -> None:
@@ -93,15 +96,16 @@ class Calibrations:
         if was == r.value:
             return ()
         self._forget_answers()
-        changed = tuple(c for c in COMPASSES if self._correction(c) != before[c])
+        swapped = tuple(c for c in COMPASSES if r.name == device_name(c) and was is not None)
+        changed = swapped or tuple(c for c in COMPASSES if self._correction(c) != before[c])
         if r.value not in self._expected.get(r.name, ()):
             for c in changed:
-                self._epoch[c] += 1
+                self._epoch[c] += not only_offsets_moved(before[c], self._correction(c))
                 self._changed[c] = self._changed[c] or was is not None
         return changed
 
     def _correction(self, compass: int) -> tuple[object, ...]:
-        """All that decides how this compass's stream was corrected; equal means undone alike."""
+        """All that decides how this compass's stream was corrected, offsets first; equal means undone alike."""
         n, get = _suffix(compass), self._held.get
         offset, mode = self.offsets(compass), get("COMPASS_MOTCT", 0.0)
         motor = tuple(get(f"COMPASS_MOT{n}_{a}", 0.0) for a in _AXES) if mode else ()

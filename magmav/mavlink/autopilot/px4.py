@@ -28,7 +28,7 @@ import numpy as np
 
 from magmav.core.orientation import CUSTOM, PX4, body_from_sensor, rotation
 from magmav.core.types import IDENTITY3, NO_SHAPING, ZERO3, Mat3, ParamReading, Shaping, Vec3, mat3, vec3
-from magmav.mavlink.autopilot.stored import invertible
+from magmav.mavlink.autopilot.stored import invertible, only_offsets_moved
 
 SLOTS = (0, 1, 2, 3)
 RAW = "sensor_mag"
@@ -68,8 +68,9 @@ class _Parts(NamedTuple):
 class Px4Calibrations:
     """What one PX4 vehicle holds for its compasses, see StoredCalibrations.
 
-    While disarmed, an offset that moves starts no new epoch: after every landing PX4 moves them by itself
-    (SENS_MAG_AUTOCAL), and the move is undone exactly, but for a change under 10 mG that PX4 takes up on restart only.
+    An offset that moves starts no new epoch, once it was known: it is undone exactly, but for a change under 10 mG that
+    PX4 takes up on restart only. While disarmed it is no change worth telling of either: after every landing PX4 moves
+    them by itself (SENS_MAG_AUTOCAL).
     """
 
     def __init__(self) -> None:
@@ -92,23 +93,29 @@ class Px4Calibrations:
         self._held[r.name] = r.value
         self._parts.clear()
         changed = tuple(c for c in self._from if self._correction(c) != before[c])
-        own_doing = r.value in self._expected.get(r.name, ()) or (r.name.endswith("OFF") and not self._armed)
-        if not own_doing:
-            for c in changed:
-                self._epoch[c] = self.epoch(c) + 1
-                if was is not None:
-                    self._changed.add(c)
+        if r.value in self._expected.get(r.name, ()):
+            return changed
+        for c in changed:
+            moved = only_offsets_moved(before[c], self._correction(c))
+            self._epoch[c] = self.epoch(c) + (not moved)
+            if was is not None and (self._armed or not moved):
+                self._changed.add(c)
         return changed
 
     def _correction(self, compass: int) -> tuple[object, ...]:
-        """All that decides how this compass's readings are taken back to the sensor; equal means alike."""
+        """All that decides how this compass's readings are taken back to the sensor, offsets first; equal means alike.
+
+        The offsets are None where not all of them are known, and () where the readings do not have them in.
+        """
         device, source = self._from[compass]
         n = slot_of(device, self._held)
         parts = self._parts_of(compass)
         motor = () if n is None else tuple(_triple(self._held, n, "COMP", 0.0))
         offsets = tuple(parts.offset_mg) if source in CORRECTED else ()
+        known = offsets if self.known(compass) else None
         by = self._held.get("CAL_MAG_COMP_TYP", 0.0)
-        return (parts.rotation.tobytes(), parts.shaping.matrix.tobytes(), offsets, by, motor if by else ())
+        rest = (parts.rotation.tobytes(), parts.shaping.matrix.tobytes(), by, motor if by else ())
+        return (known, *rest, None if known else offsets)
 
     def sensor(self, compass: int, device_id: int, source: str) -> None:
         """This compass's readings come from this device, through this message. Another device is another epoch."""

@@ -22,12 +22,18 @@ def invertible(offset_b_mg: Vec3, shaping: Shaping) -> bool:
     return bool(values[0] < _MOST_GAIN and values[-1] > _LEAST_GAIN)
 
 
+def only_offsets_moved(before: tuple[object, ...], after: tuple[object, ...]) -> bool:
+    """Of two corrections, offsets first: both know them (None: not), they differ, and nothing else does."""
+    return None not in (before[0], after[0]) and before[0] != after[0] and before[1:] == after[1:]
+
+
 class StoredCalibrations(Protocol):
     """What one vehicle holds for its compasses, as far as it has been heard, and how to undo it.
 
     Inside, the autopilot's own names, units, signs and axes; outside, offsets to be added, mG, body axes, with
     truth = shaping.matrix @ (sensor + offsets) + shaping.motor_b_mg, where sensor is the sensor's own field turned
-    into body axes. ``epoch(compass)`` grows whenever data before and after must not be mixed.
+    into body axes. ``epoch(compass)`` grows whenever data before and after must not be mixed; a change of offsets that
+    were known is undone exactly and does not count.
     """
 
     def param(self, r: ParamReading) -> tuple[int, ...]:
