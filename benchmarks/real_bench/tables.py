@@ -65,7 +65,7 @@ def ready_table(rows: list[Ready]) -> str:
         cells += [num(r.full_deg), num(r.offsets_deg), num(r.sigma_deg, 1), num(r.best_rest_deg), num(r.best_deg)]
         cells += [
             "-" if r.wrong is None else "WRONG" if r.wrong else "right",
-            f"{r.wrong_s:.0f} of {r.ready_s:.0f}",
+            f"{r.wrong_s:.0f} / {r.offsets_wrong_s:.0f} of {r.ready_s:.0f}",
             why,
         ]
         lines.append(cells)
