@@ -15,11 +15,12 @@ from magmav.core.estimators import ESTIMATORS
 from magmav.core.estimators.adaptive import AdaptiveEstimator, without_prior
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.bank import Bank, field_covariance
-from magmav.core.estimators.adaptive.measurement import Equation, noise
+from magmav.core.estimators.adaptive.block import Gathering
+from magmav.core.estimators.adaptive.measurement import Equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import body_from_earth
-from magmav.core.types import vec3
+from magmav.core.types import ZERO3, Shaping, mat3, vec3
 
 HERE = (EXPECTED.horizontal_mg, EXPECTED.down_mg)
 
@@ -42,81 +43,120 @@ def states(seed, k=4):
     x[:, at.ALPHA] = rng.uniform(-3, 3, k)
     x[:, at.B] = rng.normal(0, 200, (k, 3))
     x[:, at.H], x[:, at.V] = rng.uniform(150, 300, k), rng.uniform(-450, 450, k)
-    for part, size in ((at.E, 0.01), (at.D, 4), (at.K, 50), (at.G, 0.01)):
-        x[:, part] = rng.normal(0, size, (k, 3))
+    for part, size in ((at.E, 0.01), (at.D, 4), (at.K, 50), (at.G, 0.01), (at.R, 0.01)):
+        x[:, part] = rng.normal(0, size, x[:, part].shape)
     x[:, at.T], x[:, at.KAPPA] = rng.normal(0, 0.03, k), rng.normal(0, 0.02, k)
-    matrix = np.eye(3) + rng.normal(0, 0.05, (3, 3))
-    body = body_from_earth(*rng.uniform(-1.2, 1.2, 3))
-    return x, body, matrix, rng.normal(0, 0.5, 3)
+    return x
+
+
+def block_of(seed, n=3):
+    """n readings in a row at any attitude, turning fast, through a matrix that is not the identity."""
+    rng = np.random.default_rng(100 + seed)
+    shaping = Shaping(mat3(np.eye(3) + rng.normal(0, 0.05, (3, 3)), "matrix"), ZERO3)
+    gathering = Gathering()
+    (first,) = samples("figure eight", 5, seconds=1.0)[:1]
+    for _ in range(n):
+        body = body_from_earth(*rng.uniform(-3, 3, 3))
+        gathering.passes(0.07, body[:, 2], 1e-6)
+        s = replace(first, shaping=shaping, rate_b_rads=vec3(rng.normal(0, 0.5, 3), "rate"))
+        gathering.add(s, rng.normal(0, 300, 3), body, float(rng.uniform(-0.5, 0.5)))
+    return gathering.close()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_every_column_of_the_jacobian_is_the_derivative(seed):
-    """At S = 0 and small tilt errors; the tilt, delay and kappa columns are exact in themselves."""
-    x, body, matrix, rate = states(seed)
-    x[:, at.E] = x[:, at.T : at.T + 1] = x[:, at.KAPPA :] = 0.0
-    equation = Equation(len(x))
-    y, j, u = equation(x, body, matrix, rate, 0.3)
+    """At S = 0 and small tilt errors; the tilt, mounting, delay and kappa columns are exact in themselves."""
+    x, block = states(seed), block_of(seed)
+    x[:, at.E] = x[:, at.R] = x[:, at.T : at.T + 1] = x[:, at.KAPPA : at.KAPPA + 1] = 0.0
+    equation = Equation(len(x), len(block))
+    y, j, u = equation(x, block)
     j, y = j.copy(), y.copy()
-    assert np.linalg.norm(u, axis=1) == pytest.approx(np.hypot(x[:, at.H], x[:, at.V]))
+    assert np.linalg.norm(u, axis=2) == pytest.approx(np.tile(np.hypot(x[:, at.H], x[:, at.V]), (3, 1)).T)
     for i in range(at.SIZE):
         step = 1e-6 * max(1.0, float(np.abs(x[:, i]).max()))
         up, down = x.copy(), x.copy()
         up[:, i] += step
         down[:, i] -= step
-        slope = (equation(up, body, matrix, rate, 0.3)[0] - equation(down, body, matrix, rate, 0.3)[0]) / (2 * step)
-        assert slope == pytest.approx(j[:, :, i], rel=1e-6, abs=1e-5), i
+        slope = (equation(up, block)[0] - equation(down, block)[0]) / (2 * step)
+        assert slope == pytest.approx(j[..., i], rel=1e-6, abs=1e-5), i
+
+
+def test_the_equation_is_the_one_that_is_written():
+    """Term by term, in plain matrices, for one hypothesis and one reading."""
+    x, block = states(8, k=1), block_of(8, n=2)
+    (y, *_), (row,) = Equation(1, 2)(x, block)[0], x
+    for i in range(2):
+        r = np.column_stack((block.north_b[i], block.east_b[i], block.down_b[i]))
+        a = row[at.ALPHA] - row[at.G] @ block.ahead_s[i]
+        u = r @ (row[at.H] * math.cos(a), row[at.H] * math.sin(a), row[at.V])
+        lean = np.cross((0.0, 0.0, 1.0), block.down_b[i])
+        moved = r @ (*row[at.E], 0.0) + (*row[at.R], 0.0) + row[at.KAPPA] * lean
+        moved = np.cross(moved + row[at.T] * block.rate_b_rads[i], u)
+        want = (np.eye(3) + soft_matrix(row[at.S])) @ (u + moved) + block.shaping.matrix @ row[at.B]
+        assert y[i] == pytest.approx(want + row[at.D] + block.drive[i] * row[at.K])
 
 
 def test_time_is_f_p_f_and_q():
     rng = np.random.default_rng(1)
     n, dt = Tuning(), 0.7
-    x, *_ = states(2)
+    bank = Bank.begun((*HERE[:1], 5.0, HERE[1], 5.0), n)
+    bank.keep(np.arange(4))
     root = rng.normal(0, 1, (4, at.SIZE, at.SIZE))
-    p = root @ root.transpose(0, 2, 1)
-    down, walk, dist = np.array((0.1, -0.2, 0.6)), np.array((0.05, 1.5, 0.05, 0.3)), np.full(4, 2.0)
-    f, q = np.eye(at.SIZE), np.zeros((4, at.SIZE, at.SIZE))
-    f[at.ALPHA, at.G] = down
-    tilt, short = math.exp(-dt / n.tilt_tau_s), math.exp(-dt / n.disturbance_tau_s)
-    f[at.E, at.E], f[at.D, at.D] = tilt * np.eye(3), short * np.eye(3)
-    q[:, 0, 0] = 0.02
-    for i in range(3):
-        q[:, 1 + i, 1 + i] = walk**2 * dt
-        q[:, 6 + i, 6 + i] = (1 - tilt**2) * 0.01**2
-        q[:, 9 + i, 9 + i] = (1 - short**2) * dist**2
-    want_x, want_p = x @ f.T, f @ p @ f.T + q
-    advance(x, p, dt, down, 0.02, 0.01, walk, dist, n)
-    assert x == pytest.approx(want_x, abs=1e-12)
-    assert p == pytest.approx(want_p, rel=1e-10, abs=1e-10)
+    bank.x, bank.p = states(2), root @ root.transpose(0, 2, 1)
+    bank.walk_mg, bank.disturbance_mg = np.array((0.05, 1.5, 0.05, 0.3)), np.full(4, 2.0)
+    down = np.array((0.1, -0.2, 0.6))
+    for own, sigma, tau in ((False, n.tilt_rad, n.tilt_tau_s), (True, n.own_tilt_rad, n.own_tilt_tau_s)):
+        f, q = np.eye(at.SIZE), np.zeros((4, at.SIZE, at.SIZE))
+        f[at.ALPHA, at.G] = down
+        tilt, short = math.exp(-dt / tau), math.exp(-dt / n.disturbance_tau_s)
+        f[at.E, at.E], f[at.D, at.D] = tilt * np.eye(2), short * np.eye(3)
+        q[:, 0, 0] = 0.02
+        for i in range(3):
+            q[:, at.B.start + i, at.B.start + i] = bank.walk_mg**2 * dt
+            q[:, at.D.start + i, at.D.start + i] = (1 - short**2) * bank.disturbance_mg**2
+        for i in range(2):
+            q[:, at.E.start + i, at.E.start + i] = (1 - tilt**2) * sigma**2
+        want_x, want_p = bank.x @ f.T, f @ bank.p @ f.T + q
+        advance(bank, dt, down, 0.02, own, n)
+        assert bank.x == pytest.approx(want_x, abs=1e-12)
+        assert bank.p == pytest.approx(want_p, rel=1e-10, abs=1e-10)
 
 
-def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(monkeypatch):
+@pytest.mark.parametrize("readings", [1, 4])
+def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(readings):
     """Same model, same noise, no doubt and no adaptation: only the algebra is left."""
-    calm = Tuning(doubt_nis=1e12, adapt_every=10**9, change_chi2=1e12, change_disturbance=1e12, prune_every=10**9)
-    mine = AdaptiveEstimator(calm)
+    calm = Tuning(doubt_nis=1e12, adapt_after=10**9, change_chi2=1e12, prune_every=10**9, block_readings=readings)
+    mine = AdaptiveEstimator(replace(calm, block_s=10.0))
     flight = placed(samples("figure eight", 5, seconds=12.0))
     bank = Bank.begun((HERE[0], calm.model_mg, HERE[1], calm.model_mg), calm)
     bank.keep(np.array([3]))
     mine._bank, mine._model_mg = bank, HERE
-    theirs = ExtendedKalmanFilter(dim_x=at.SIZE, dim_z=3)
+    theirs = ExtendedKalmanFilter(dim_x=at.SIZE, dim_z=3 * readings)
     theirs.x, theirs.P = bank.x[0].copy(), bank.p[0].copy()
-    equation, yaw = Equation(1), 0.0
-    for s in flight[1:]:
+    copy_of, equation, gathering, yaw = copy.deepcopy(bank), Equation(1, readings), Gathering(), 0.0
+    for i, s in enumerate(flight, 1):
         yaw += s.yaw_step_rad
         body = body_from_earth(s.roll_rad, s.pitch_rad, yaw)
-        x, p = theirs.x[None].copy(), theirs.P[None].copy()
         about_down = float(s.rate_b_rads @ body[:, 2]) * s.dt_s
         turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * about_down) ** 2
-        iron, dist = np.array([MODELS[0].iron_walk_mg]), np.array([calm.disturbance_mg])
-        advance(x, p, s.dt_s, body[:, 2] * s.dt_s, turn2, calm.tilt_rad, iron, dist, calm)
-        theirs.x, theirs.P = x[0], p[0]
-        y, j, u = equation(x, body, np.eye(3), s.rate_b_rads, 0.0)
-        smear = (calm.sync_s * math.hypot(*s.rate_b_rads)) ** 2
-        r = noise(u, np.array([calm.reading_mg**2]), smear)[0]
-        theirs.update(s.mag_b_mg, lambda _, j=j: j[0].copy(), lambda _, y=y: y[0].copy(), R=r)
+        gathering.passes(s.dt_s, body[:, 2], turn2)
+        gathering.add(s, s.mag_b_mg, body, 0.0)
         mine.step(s)
-        assert mine._bank.x[0] == pytest.approx(theirs.x, rel=1e-9, abs=1e-8)
-        assert mine._bank.p[0] == pytest.approx(theirs.P, rel=1e-6, abs=1e-6)
+        if i % readings:
+            continue
+        block = gathering.close()
+        copy_of.x, copy_of.p = theirs.x[None].copy(), theirs.P[None].copy()
+        if i > readings:
+            advance(copy_of, block.dt_s, block.down_s, block.turn_rad2, False, calm)
+        theirs.x, theirs.P = copy_of.x[0], copy_of.p[0]
+        y, j, u = equation(copy_of.x, block)
+        r = np.kron(np.ones((readings, readings)), calm.common_mg**2 * np.eye(3))
+        for m, one in enumerate(smear(u, block.rate_b_rads, calm.sync_s)[0]):
+            r[3 * m : 3 * m + 3, 3 * m : 3 * m + 3] += one + calm.white_mg**2 * np.eye(3)
+        rows, said = j[0].reshape(-1, at.SIZE).copy(), y[0].ravel().copy()
+        theirs.update(block.z.ravel(), lambda _, j=rows: j, lambda _, y=said: y, R=r)
+        assert mine._bank.x[0] == pytest.approx(theirs.x, rel=1e-8, abs=1e-7)
+        assert mine._bank.p[0] == pytest.approx(theirs.P, rel=1e-5, abs=1e-6)
 
 
 def test_taking_the_prior_back_leaves_what_the_data_say():

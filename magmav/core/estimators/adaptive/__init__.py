@@ -1,9 +1,11 @@
 """The adaptive estimator: a small bank of error-state filters over headings and models, on one measurement equation.
 
 layout       what the state holds
+block        a few samples in a row, taken in together
 process      how time passes
 measurement  the one equation and its Jacobian
 bank         hypotheses and weights
+robust       wild readings, doubt, and noise as it shows
 change       a sudden change of the iron
 tuning       every chosen number
 """
@@ -16,10 +18,12 @@ import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.bank import Bank, field_covariance
+from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import Equation, noise, soft_matrix
+from magmav.core.estimators.adaptive.measurement import Equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.process import advance
+from magmav.core.estimators.adaptive.robust import WildGate, adapt, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
@@ -34,147 +38,118 @@ class AdaptiveEstimator:
     def __init__(self, tuning: Tuning | None = None) -> None:
         self.tuning = tuning or Tuning()
         self._bank: Bank | None = None
+        self._gathering = Gathering()
+        self._wild = WildGate()
+        self._equation = Equation(0, 0)
+        self._change = ChangeWatch(self.tuning)
         self._own_yaw_rad = 0.0
-        self._idle_s = 0.0
-        self._idle_down = np.zeros(3)
-        self._idle_turn_rad2 = 0.0
         self._lost = False
         self._drive = 0.0  # mean of what k is multiplied with
-        self._samples = 0
+        self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
-        self._nis = 1.0
-        self._change = ChangeWatch(self.tuning)
         self._residual_n = 0
+        self._nis = 1.0
         self._axes = 3
-        self._equation = Equation(0)
         self._model_mg: tuple[float, float] | None = None
 
     # ------------------------------------------------------------ time
 
     def step(self, s: Sample) -> None:
         """Learn from one sample, or carry time forward."""
-        n = self.tuning
+        n, gathering = self.tuning, self._gathering
+        if len(gathering) and (s.gap or not s.learn or not gathering.fits(s)):
+            self._learn()
         self._own_yaw_rad += s.yaw_step_rad
         body_from_own = s.body_from_own
         if body_from_own is None:
             body_from_own = body_from_earth(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
-        dt = max(s.dt_s, 0.0)
-        self._idle_s += dt
-        self._idle_down += dt * body_from_own[:, 2]
+        down_b, dt = body_from_own[:, 2], max(s.dt_s, 0.0)
         walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
-        about_down = float(s.rate_b_rads @ body_from_own[:, 2]) * dt
-        self._idle_turn_rad2 += walk**2 * dt + (n.turn_scale * about_down) ** 2
+        about_down = float(s.rate_b_rads @ down_b) * dt
+        gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
         self._lost = self._lost or s.gap
         if not s.learn:
             return
-        self._axes = s.axes
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        if self._wild.step(z, math.hypot(*s.rate_b_rads.tolist()) * dt):
+            return
+        drive = 0.0 if s.throttle is None else s.throttle - 0.5
+        self._samples += 1
+        self._drive += (drive - self._drive) / min(self._samples, 2000)
         if self._bank is None:
-            self._bank = Bank.begun(self._prior(s, z, body_from_own), n)
-            self._forget_idle()
-        bank = self._bank
-        if self._lost:
-            bank.lose_heading(n)
+            self._bank = Bank.begun(self._prior(s, z, down_b), n)
         if self._model_mg is None and s.model_mg is not None:
             self._model_mg = s.model_mg
-            bank.tell_field(*s.model_mg, n)
-        tilt = n.tilt_rad if s.tilt_from == "ATTITUDE" else n.own_tilt_rad
-        if self._idle_s > 0.0:
-            advance(
-                bank.x,
-                bank.p,
-                self._idle_s,
-                self._idle_down,
-                self._idle_turn_rad2,
-                tilt,
-                bank.walk_mg,
-                bank.disturbance_mg,
-                n,
-            )
-        self._update(bank, s, z, body_from_own, self._idle_s)
-        self._forget_idle()
-        self._samples += 1
-        if self._samples % n.prune_every == 0 and len(bank) > len(MODELS):
-            bank.tidy(n)
+            self._bank.tell_field(*s.model_mg, n)
+        gathering.add(s, z, body_from_own, drive)
+        if len(gathering) == n.block_readings or gathering.span_s + dt > n.block_s:
+            self._learn()
 
-    def _prior(self, s: Sample, z: Array, body_from_own: Array) -> tuple[float, float, float, float]:
+    def _prior(self, s: Sample, z: Array, down_b: Array) -> tuple[float, float, float, float]:
         n = self.tuning
         self._model_mg = s.model_mg
         if s.model_mg is not None:
             return s.model_mg[0], n.model_mg, s.model_mg[1], n.model_mg
-        return (*n.blind_h_mg, float(z @ body_from_own[:, 2]), n.blind_v_mg)
-
-    def _forget_idle(self) -> None:
-        self._lost = False
-        self._idle_s = self._idle_turn_rad2 = 0.0
-        self._idle_down = np.zeros(3)
+        return (*n.blind_h_mg, float(z @ down_b), n.blind_v_mg)
 
     # ------------------------------------------------------------ learning
 
-    def _update(self, bank: Bank, s: Sample, z: Array, body_from_own: Array, dt_s: float) -> None:
-        n, k = self.tuning, s.axes
-        if len(self._equation) != len(bank):
-            self._equation = Equation(len(bank))
-        drive = 0.0 if s.throttle is None else s.throttle - 0.5
-        self._drive += (drive - self._drive) / min(self._samples + 1, 2000)
-        y, j, u = self._equation(bank.x, body_from_own, s.shaping.matrix, s.rate_b_rads, drive)
-        smear = (n.sync_s * math.hypot(*s.rate_b_rads)) ** 2
-        r = noise(u, n.reading_mg**2 * bank.scale, smear)
-        y, j, r = y[:, :k], j[:, :k], r[:, :k, :k]
-        nu = z[:k] - y
-        pj = bank.p @ j.transpose(0, 2, 1)
-        expected = j @ pj + r
+    def _learn(self) -> None:
+        """Take in the block that has gathered."""
+        n, bank, block = self.tuning, self._bank, self._gathering.close()
+        assert bank is not None  # made with the first sample
+        if self._lost:
+            bank.lose_heading(n)
+            self._lost = False
+        if block.dt_s > 0.0 and self._blocks:
+            advance(bank, block.dt_s, block.down_s, block.turn_rad2, block.own_tilt, n)
+        self._update(bank, block)
+        self._blocks += 1
+        if self._blocks % n.prune_every == 0 and len(bank) > len(MODELS):
+            bank.tidy(n)
+
+    def _update(self, bank: Bank, block: Block) -> None:
+        n, k, count, size = self.tuning, block.axes, len(bank), len(block)
+        self._axes = k
+        if self._equation.shape != (count, size):
+            self._equation = Equation(count, size)
+        y, j, u = self._equation(bank.x, block)
+        nu = (block.z - y)[..., :k]
+        rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
+        pj = bank.p @ rows.transpose(0, 2, 1)
+        expected = rows @ pj
+        apart = expected.reshape(count, size, k, size, k)
+        np.einsum("kiaja->kija", apart)[...] += bank.common_mg2[:, None, None, None]
+        own = np.einsum("kiaib->kiab", apart)
+        own += smear(u, block.rate_b_rads, n.sync_s)[..., :k, :k]
+        np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
+        doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)
-        pull = (inverse @ nu[:, :, None])[:, :, 0]
-        nis = (nu * pull).sum(1)
-        log_likelihood = -0.5 * (np.minimum(nis, n.doubt_nis) - np.log(np.linalg.det(inverse)))
-        doubt = np.minimum(n.doubt_nis / np.maximum(nis, 1e-9), 1.0)
-        if doubt.min() < 1.0:
-            inverse = inverse * doubt[:, None, None]
-            pull = pull * doubt[:, None]
+        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(1)
+        flat = nu.reshape(count, size * k)
+        pull = (inverse @ flat[:, :, None])[:, :, 0]
+        nis = (flat * pull).sum(1)
         gain = pj @ inverse
         bank.x += (pj @ pull[:, :, None])[:, :, 0]
         bank.p -= gain @ pj.transpose(0, 2, 1)
         bank.p = 0.5 * (bank.p + bank.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
-        bank.weigh(log_likelihood, dt_s, n)
+        bank.weigh(-0.5 * (nis + log_det), block.dt_s, n)
         best = int(np.argmax(bank.log_weight))
-        white = self._adapt(bank, nu, expected, dt_s, k)
-        push = bank.x[best, at.D] / bank.disturbance_mg[best]
-        like = float(bank.product[best] / max(bank.square[best], 0.1))
-        if self._samples > 30 and self._change.step(white[best], nu[best], like, float(push @ push), dt_s):
-            self._change.open(bank)
-            self._residual_n = 0
-        self._nis += min(dt_s / 2.0, 0.2) * (min(float(nis[best]), 40.0) / k - self._nis)
-        left = nu[best] - j[best] @ (pj[best] @ pull[best]) + bank.x[best, at.D][:k]
-        self._residual_n += 1
-        weight = 1.0 / min(self._residual_n, 500)
-        self._residual_mg2 += weight * (float(left @ left) / k - self._residual_mg2)
-
-    def _adapt(self, bank: Bank, nu: Array, expected: Array, dt_s: float, k: int) -> Array:
-        """Noise as it shows: white noise scales the reading's variance, coloured noise the disturbance.
-
-        The whitened innovations (K, k), clipped.
-        """
-        n = self.tuning
-        white = nu / np.sqrt(expected.reshape(len(bank), k * k)[:, :: k + 1])
-        np.maximum(white, -4.0, out=white)
-        np.minimum(white, 4.0, out=white)
-        if self._samples > 20:
-            weight = min(dt_s / 5.0, 0.05)
-            bank.square += weight * ((white * white).sum(1) / k - bank.square)
-            bank.product += weight * ((white * bank.last[:, :k]).sum(1) / k - bank.product)
-        bank.last[:, :k] = white
-        if self._samples % n.adapt_every or self._samples <= 60:
-            return white
-        rate = min(n.adapt_every * dt_s / 10.0, 0.2)
-        bank.scale = np.clip(bank.scale * np.exp(rate * np.clip(bank.square - 1.0, -1.0, 2.0)), n.scale_lo, n.scale_hi)
-        like = np.clip(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
-        bank.disturbance_mg = np.clip(
-            bank.disturbance_mg * np.exp(rate * np.clip(4.0 * (like - 0.1), -1.0, 2.0)),
-            n.disturbance_lo_mg,
-            n.disturbance_hi_mg,
-        )
-        return white
+        mean = nu.mean(1)
+        variance = np.einsum("kiaja->ka", apart) / size**2
+        white = np.clip(mean / np.sqrt(variance), -4.0, 4.0)
+        if self._blocks > n.adapt_after:
+            adapt(bank, nu, white, bank.common_mg2[:, None] / variance, block.dt_s, n)
+            push = bank.x[best, at.D] / bank.disturbance_mg[best]
+            like = float(bank.product[best] / max(bank.square[best], 0.1))
+            if self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s):
+                self._change.open(bank)
+                self._residual_n = 0
+        self._nis += min(block.dt_s / 2.0, 0.5) * (min(float(nis[best]), 40.0 * size) / (k * size) - self._nis)
+        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
+        self._residual_n += size
+        weight = size / min(self._residual_n, 500)
+        self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
 
     # ------------------------------------------------------------ answer
 

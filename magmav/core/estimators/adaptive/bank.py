@@ -11,7 +11,7 @@ from magmav.core.estimators.adaptive.layout import Array, Index
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import TAU
 
-_COLUMNS = ("x", "p", "model", "log_weight", "scale", "disturbance_mg", "square", "product", "last", "prior", "walk_mg")
+_COLUMNS = tuple("x p model log_weight prior walk_mg white_mg2 common_mg2 disturbance_mg square product last".split())
 
 
 def field_covariance(h_mg: float, v_mg: float, n: Tuning) -> Array:
@@ -27,10 +27,12 @@ class Bank:
     def __init__(self, x: Array, p: Array, model: Index, log_weight: Array, n: Tuning) -> None:
         self.x, self.p, self.model, self.log_weight = x, p, model, log_weight
         k = len(x)
-        self.scale = np.ones(k)  # of the reading's variance
+        self.white_mg2 = np.full(k, n.white_mg**2)  # variance of one reading's own noise
+        self.common_mg2 = np.full(k, n.common_mg**2)  # of what all readings of a block share
         self.disturbance_mg = np.full(k, n.disturbance_mg)
-        self.square, self.product = np.zeros(k), np.zeros(k)  # of the whitened innovation, and with its neighbour
-        self.last = np.zeros((k, 3))  # whitened innovation before
+        self.square, self.product = np.ones(k), np.zeros(k)  # of the whitened mean innovation, and with its neighbour
+        self.last = np.zeros((k, 3))  # the one before
+        self.seen_s = 0.0
         self.walk_mg = np.array([MODELS[m].iron_walk_mg for m in model])  # per square root of a second
         self.prior = np.log([MODELS[m].weight for m in model])
 
@@ -57,6 +59,7 @@ class Bank:
         diagonal[:, at.G] = n.gyro_rads**2
         diagonal[:, at.T] = n.delay_s**2
         diagonal[:, at.KAPPA] = n.kappa**2
+        diagonal[:, at.R] = n.mounting_rad**2
         log_weight = np.log([MODELS[m].weight / n.yaws for m in model])
         return Bank(x, p, model, log_weight, n)
 
@@ -70,6 +73,8 @@ class Bank:
         self.x[:, at.ALPHA] += np.tile(np.arange(n.yaws) * TAU / n.yaws, len(best))
         self.p[:, at.ALPHA, :] = self.p[:, :, at.ALPHA] = 0.0
         self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
+        self.x[:, at.E] = self.p[:, at.E, :] = self.p[:, :, at.E] = 0.0  # it was about axes that are lost
+        np.einsum("kii->ki", self.p)[:, at.E] = n.tilt_rad**2
 
     def tell_field(self, h_mg: float, v_mg: float, n: Tuning) -> None:
         """The world model's field, once a position is known: a measurement of H and V."""

@@ -42,7 +42,7 @@ class ChangeWatch:
         self._innovation_mg[:k] = fade * self._innovation_mg[:k] + (1.0 - fade) * innovation_mg
         self._alike += min(dt_s / _ALIKE_S, 0.1) * (like - self._alike)  # slowly: a change itself looks alike, too
         self._seen = min(self._seen + 1.0, (1.0 + fade) / (1.0 - fade))
-        if self.since_s < n.change_hold_s or self._seen < 10.0:
+        if self.since_s < n.change_hold_s or self._seen < 5.0:
             return False
         alike = min(max(self._alike, 0.0), 0.9)
         leaning = float(self._mean @ self._mean) * self._seen * (1.0 - alike) / (1.0 + alike)

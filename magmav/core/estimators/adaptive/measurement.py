@@ -1,9 +1,9 @@
-"""The one measurement equation, for every hypothesis at once.
+"""The one measurement equation, for every hypothesis and every sample of a block at once.
 
-    A m + e = A b + (I + S)(u + (e_tilt + kappa t) x u + tau w x u) + k (throttle - 1/2) + d + noise
-    u = R_bo (H cos alpha, H sin alpha, V)
-R_bo takes the own frame to body axes; t is the vehicle's tilt as a rotation; w the body rate. It holds the norm, the
-dip, the turning and the world model, each with its own direction. Angles of attitude appear nowhere: no gimbal.
+    A m + e = A b + (I + S)(u + (R_bo e_tilt + r + kappa t) x u + tau w x u) + k (throttle - 1/2) + d + noise
+    u = R_bo (H cos a, H sin a, V),   a = alpha - g . (integral of down since the sample)
+R_bo takes the own frame to body axes; t is the vehicle's tilt as a rotation, r that of the mounting; w the body rate.
+It holds the norm, the dip, the turning and the world model, each with its own direction. Angles of attitude appear nowhere: no gimbal.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.rotation import cross_matrix
 
 _EYE3 = np.eye(3)
 _PLACES = np.array((0, 3, 4, 3, 1, 5, 4, 5, 2))  # where each entry of S stands among the six
@@ -24,64 +24,67 @@ def soft_matrix(s: Array) -> Array:
     return out
 
 
+# (3, 18): u times this is S u as a matrix of the six of S
+_SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel() for unit in _EYE3])
+
+
 class Equation:
-    """Predictions and Jacobians of K hypotheses; the arrays are kept, so what never changes is written once."""
+    """Predictions and Jacobians of K hypotheses for n samples; the array is kept, what never changes written once."""
 
-    def __init__(self, k: int) -> None:
-        self._j = np.zeros((k, 3, at.SIZE))
-        for i in range(3):
-            self._j[:, i, at.D.start + i] = 1.0
+    def __init__(self, k: int, n: int) -> None:
+        self._j = np.zeros((k, n, 3, at.SIZE))
+        self._j[:, :, :, at.D] = _EYE3
 
-    def __len__(self) -> int:
-        return len(self._j)
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(K, n)."""
+        return self._j.shape[0], self._j.shape[1]
 
-    def __call__(
-        self, x: Array, body_from_own: Array, matrix: Array, rate_b: Array, drive: float
-    ) -> tuple[Array, Array, Array]:
-        """Predicted A m + e (K, 3) mG, its Jacobian (K, 3, n) (good until the next call), and the field u (K, 3) mG.
+    def __call__(self, x: Array, block: Block) -> tuple[Array, Array, Array]:
+        """Predicted A m + e (K, n, 3) mG, its Jacobian (K, n, 3, SIZE) (good until the next call), and u (K, n, 3) mG.
 
         The columns of H, V, tilt and soft iron are taken at S = 0: relinearised there, the product of field and soft
         iron invents information (estimation.md section 7.4).
         """
         j = self._j
-        c, s = np.cos(x[:, at.ALPHA]), np.sin(x[:, at.ALPHA])
-        earth = np.zeros((2, len(x), 3))
-        earth[0, :, 0], earth[0, :, 1] = c, s  # horizontal north in the own frame, and a right angle on from it
-        earth[1, :, 0], earth[1, :, 1] = -s, c
-        ahead, beside = earth @ body_from_own.T
-        down = body_from_own[:, 2]
-        h = x[:, at.H, None]
-        u = h * ahead + x[:, at.V, None] * down
-        tilt = cross_matrix(-down[1], down[0], 0.0)
-        late, leaning = u @ cross_matrix(*rate_b.tolist()).T, u @ tilt.T
-        ux, uy, uz = u.T
-        e0, s0 = at.E.start, at.S.start
-        j[:, 0, e0 + 1], j[:, 0, e0 + 2] = uz, -uy
-        j[:, 1, e0], j[:, 1, e0 + 2] = -uz, ux
-        j[:, 2, e0], j[:, 2, e0 + 1] = uy, -ux
-        j[:, 0, s0], j[:, 1, s0 + 1], j[:, 2, s0 + 2] = ux, uy, uz
-        j[:, 0, s0 + 3], j[:, 1, s0 + 3] = uy, ux
-        j[:, 0, s0 + 4], j[:, 2, s0 + 4] = uz, ux
-        j[:, 1, s0 + 5], j[:, 2, s0 + 5] = uz, uy
-        moved = (j[:, :, at.E] @ x[:, at.E, None])[:, :, 0] + x[:, at.KAPPA, None] * leaning + x[:, at.T, None] * late
+        k, n = self.shape
+        angle = (x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T)[:, :, None]
+        c, s = np.cos(angle), np.sin(angle)
+        ahead = c * block.north_b + s * block.east_b  # the horizontal field's direction, and a right angle on from it
+        beside = c * block.east_b - s * block.north_b
+        h = x[:, at.H, None, None]
+        u = h * ahead + x[:, at.V, None, None] * block.down_b
+        turned = h * beside
+        crossed = (block.crosses @ u[..., None])[..., 0]
+        leaning, late = crossed[..., :3], crossed[..., 3:]
+        v = x[:, at.V, None, None]
+        j[..., at.E.start] = h * s * block.down_b - v * block.east_b
+        j[..., at.E.start + 1] = v * block.north_b - h * c * block.down_b
+        j[..., 1, at.R.start], j[..., 2, at.R.start] = -u[..., 2], u[..., 1]
+        j[..., 0, at.R.start + 1], j[..., 2, at.R.start + 1] = u[..., 2], -u[..., 0]
+        moved = (j[..., at.E] @ x[:, None, at.E, None] + j[..., at.R] @ x[:, None, at.R, None])[..., 0]
+        moved += x[:, at.KAPPA, None, None] * leaning + x[:, at.T, None, None] * late
         seen = u + moved
         soft = soft_matrix(x[:, at.S])
-        y = seen + (soft @ seen[:, :, None])[:, :, 0] + x[:, at.B] @ matrix.T + drive * x[:, at.K] + x[:, at.D]
-        turned = h * beside
-        j[:, :, at.ALPHA] = turned + (soft @ turned[:, :, None])[:, :, 0]
-        j[:, :, at.B] = matrix
-        j[:, :, at.H] = ahead
-        j[:, :, at.V] = down
-        j[:, :, at.K] = drive * _EYE3
-        j[:, :, at.T] = late
-        j[:, :, at.KAPPA] = leaning
+        constant = x[:, None, at.B] @ block.shaping.matrix.T + x[:, None, at.D]
+        y = seen + seen @ soft + constant + block.drive[:, None] * x[:, None, at.K]
+        turning = turned + turned @ soft
+        j[..., at.ALPHA] = turning
+        j[..., at.B] = block.shaping.matrix
+        j[..., at.H] = ahead
+        j[..., at.V] = block.down_b
+        j[..., at.K] = block.drive[:, None, None] * _EYE3
+        j[..., at.S] = (u @ _SOFT).reshape(k, n, 3, 6)
+        j[..., at.G] = -turning[..., None] * block.ahead_s[:, None, :]
+        j[..., at.T] = late
+        j[..., at.KAPPA] = leaning
         return y, j, u
 
 
-def noise(u: Array, variance: Array, smear: float) -> Array:
-    """R (K, 3, 3): white noise, and what a mismatch in time does, which never changes the field's length."""
-    square = (u * u).sum(1)
-    out = (-smear * u[:, :, None]) * u[:, None, :]
-    diagonal = out.reshape(len(u), 9)[:, ::4]
-    diagonal += (variance + smear * square)[:, None]
+def smear(u: Array, rate_b_rads: Array, sync_s: float) -> Array:
+    """(K, n, 3, 3) mG^2: what a mismatch in time does to a turning field; it never changes the field's length."""
+    share = sync_s**2 * (rate_b_rads * rate_b_rads).sum(1)
+    out: Array = (-share[:, None, None] * u[..., :, None]) * u[..., None, :]
+    diagonal = out.reshape(*out.shape[:2], 9)[..., ::4]
+    diagonal += (share * (u * u).sum(2))[..., None]
     return out

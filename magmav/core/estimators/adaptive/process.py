@@ -8,37 +8,32 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 
 
-def advance(
-    x: Array,
-    p: Array,
-    dt_s: float,
-    down_dt_b: Array,
-    turn_rad2: float,
-    tilt_rad: float,
-    walk_mg: Array,
-    disturbance_mg: Array,
-    n: Tuning,
-) -> None:
+def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt: bool, n: Tuning) -> None:
     """Carry all hypotheses over dt_s.
 
-    down_dt_b : (3,) integral of the down direction in body axes over the step, s: what a gyro bias turns alpha by.
-    turn_rad2 : variance of the turn the gyro reported.  walk_mg, disturbance_mg : (K,) of each hypothesis.
+    down_s : (3,) integral of the down direction in body axes over the step, s: what a gyro bias turns alpha by.
+    turn_rad2 : variance of the turn the gyro reported.  own_tilt : the tilt is that of gyro and accelerometer alone.
     """
-    x[:, at.ALPHA] += x[:, at.G] @ down_dt_b
-    p[:, at.ALPHA, :] += down_dt_b @ p[:, at.G, :]
-    p[:, :, at.ALPHA] += p[:, :, at.G] @ down_dt_b
-    tilt, short = math.exp(-dt_s / n.tilt_tau_s), math.exp(-dt_s / n.disturbance_tau_s)
-    for part, fade in ((at.E, tilt), (at.D, short)):
-        x[:, part] *= fade
-        p[:, part, :] *= fade
-        p[:, :, part] *= fade
-    diagonal = p.reshape(len(p), -1)[:, :: at.SIZE + 1]
+    x, p = bank.x, bank.p
+    x[:, at.ALPHA] += x[:, at.G] @ down_s
+    p[:, at.ALPHA, :] += down_s @ p[:, at.G, :]
+    p[:, :, at.ALPHA] += p[:, :, at.G] @ down_s
+    tilt_rad, tilt_tau_s = (n.own_tilt_rad, n.own_tilt_tau_s) if own_tilt else (n.tilt_rad, n.tilt_tau_s)
+    tilt, short = math.exp(-dt_s / tilt_tau_s), math.exp(-dt_s / n.disturbance_tau_s)
+    fade = np.ones(at.SIZE)
+    fade[at.E], fade[at.D] = tilt, short
+    x *= fade
+    p *= fade[:, None] * fade
+    diagonal = np.einsum("kii->ki", p)
     diagonal[:, at.ALPHA] += turn_rad2
-    diagonal[:, at.B] += (walk_mg**2 * dt_s)[:, None]
+    diagonal[:, at.B] += (bank.walk_mg**2 * dt_s)[:, None]
     diagonal[:, at.E] += (1.0 - tilt * tilt) * tilt_rad**2
-    diagonal[:, at.D] += ((1.0 - short * short) * disturbance_mg**2)[:, None]
+    diagonal[:, at.D] += ((1.0 - short * short) * bank.disturbance_mg**2)[:, None]

@@ -1,0 +1,123 @@
+"""A few samples in a row, taken in together: one update of every hypothesis costs as much for five as for one.
+
+Times inside a block count from its end, where the state stands: a sample's heading is alpha less what the gyro's bias
+turned since.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magmav.core.estimators.adaptive.layout import Array
+from magmav.core.rotation import cross_matrix
+from magmav.core.types import Sample, Shaping
+
+_EYE3 = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """n samples in arrays; body axes, mG, s, rad.
+
+    z (n, 3) : A m + e.  north_b, east_b, down_b (n, 3) : the own frame's axes.  rate_b_rads (n, 3).
+    crosses (n, 6, 3) : cross matrices of the vehicle's tilt and of its rate.  drive (n,) : throttle - 1/2.
+    ahead_s (n, 3) : integral of down_b from the sample to the block's end.
+    dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
+    """
+
+    z: Array
+    north_b: Array
+    east_b: Array
+    down_b: Array
+    rate_b_rads: Array
+    crosses: Array
+    drive: Array
+    ahead_s: Array
+    dt_s: float
+    down_s: Array
+    turn_rad2: float
+    shaping: Shaping
+    axes: int
+    own_tilt: bool
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+class Gathering:
+    """Samples on their way into a block, and the time that has passed since the last one."""
+
+    def __init__(self) -> None:
+        self._samples: list[Sample] = []
+        self._bodies: list[Array] = []
+        self._z: list[Array] = []
+        self._drives: list[float] = []
+        self._downs: list[Array] = []  # integral of down_b up to each sample
+        self._dt_s = 0.0
+        self._down_s: Array = np.zeros(3)
+        self._turn_rad2 = 0.0
+        self._first_s = 0.0
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first sample to now."""
+        return self._dt_s - self._first_s
+
+    def fits(self, s: Sample) -> bool:
+        """Can this sample share a block with those already here?"""
+        if not self._samples:
+            return True
+        last = self._samples[-1]
+        return s.shaping is last.shaping and s.axes == last.axes and s.tilt_from == last.tilt_from
+
+    def passes(self, dt_s: float, down_b: Array, turn_rad2: float) -> None:
+        """Time goes by."""
+        self._dt_s += dt_s
+        self._down_s = self._down_s + dt_s * down_b
+        self._turn_rad2 += turn_rad2
+
+    def add(self, s: Sample, z: Array, body_from_own: Array, drive: float) -> None:
+        """Take one sample."""
+        if not self._samples:
+            self._first_s = self._dt_s
+        self._samples.append(s)
+        self._z.append(z)
+        self._bodies.append(body_from_own)
+        self._drives.append(drive)
+        self._downs.append(self._down_s)
+
+    def close(self) -> Block:
+        """All of them as one block, and begin anew."""
+        bodies = np.array(self._bodies)
+        down_b = bodies[:, :, 2]
+        rates = np.array([s.rate_b_rads for s in self._samples])
+        crosses = np.array(
+            [
+                np.vstack((cross_matrix(-down[1], down[0], 0.0), cross_matrix(*rate)))
+                for down, rate in zip(down_b.tolist(), rates.tolist(), strict=True)
+            ]
+        )
+        last = self._samples[-1]
+        out = Block(
+            z=np.array(self._z),
+            north_b=bodies[:, :, 0],
+            east_b=bodies[:, :, 1],
+            down_b=down_b,
+            rate_b_rads=rates,
+            crosses=crosses,
+            drive=np.array(self._drives),
+            ahead_s=self._down_s - np.array(self._downs),
+            dt_s=self._dt_s,
+            down_s=self._down_s,
+            turn_rad2=self._turn_rad2,
+            shaping=last.shaping,
+            axes=last.axes,
+            own_tilt=last.tilt_from != "ATTITUDE",
+        )
+        self.__init__()  # type: ignore[misc]
+        return out

@@ -1,0 +1,70 @@
+"""What keeps single readings from deceiving the bank: a gate for wild ones, doubt for strange ones, noise as it shows.
+
+White noise shows as scatter inside a block; what all readings of a block share shows in its mean; what neighbouring
+blocks share shows as likeness of their means.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from magmav.core.estimators.adaptive.bank import Bank
+from magmav.core.estimators.adaptive.layout import Array
+from magmav.core.estimators.adaptive.tuning import Tuning
+
+_WILD_MG, _WILD_MG_PER_RAD = 50.0, 330.0
+_WILD_OF = 5
+
+
+class WildGate:
+    """Is a reading far from the middle of the last five, more than turning explains? (estimation.md section 5)"""
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[float, float, float]] = deque(maxlen=_WILD_OF)
+        self._turns: deque[float] = deque(maxlen=_WILD_OF)
+
+    def step(self, z: Array, turn_rad: float) -> bool:
+        """Take a reading (3,) and how far the vehicle turned since the one before."""
+        x, y, w = z.tolist()
+        self._last.append((x, y, w))
+        self._turns.append(turn_rad)
+        if len(self._last) < 3:
+            return False
+        middle = [sorted(axis)[len(self._last) // 2] for axis in zip(*self._last, strict=True)]
+        off: float = max(abs(x - middle[0]), abs(y - middle[1]), abs(w - middle[2]))
+        return bool(off > _WILD_MG + _WILD_MG_PER_RAD * sum(self._turns))
+
+
+def doubted(expected: Array, nu: Array, doubt_nis: float) -> None:
+    """Make what is expected of a strange reading as wide as it is strange, in place (Huber's weights).
+
+    expected (K, n, 3, 3) : each reading's own part of the innovation's covariance.  nu (K, n, 3).
+    """
+    nis = (nu * np.linalg.solve(expected, nu[..., None])[..., 0]).sum(2)
+    if nis.max() > doubt_nis:
+        expected *= np.maximum(nis / doubt_nis, 1.0)[..., None, None]
+
+
+def adapt(bank: Bank, nu: Array, mean_white: Array, mean_share: Array, dt_s: float, n: Tuning) -> None:
+    """Noise as it shows.
+
+    nu (K, n, k) : innovations.  mean_white (K, k) : their mean over the block, whitened, clipped.
+    mean_share (K, k) : how much of that mean's variance is the block's own noise.
+    """
+    weight = min(dt_s / 5.0, 0.2)
+    bank.square += weight * ((mean_white * mean_white).mean(1) - bank.square)
+    bank.product += weight * ((mean_white * bank.last[:, : mean_white.shape[1]]).mean(1) - bank.product)
+    bank.last[:, : mean_white.shape[1]] = mean_white
+    bank.seen_s += dt_s
+    rate = min(dt_s / np.clip(0.5 * bank.seen_s, n.adapt_first_s, n.adapt_s), 0.3)
+    if nu.shape[1] > 2:
+        inside = nu - nu.mean(1, keepdims=True)
+        scatter = np.median(np.abs(inside), axis=(1, 2)) ** 2 * 2.2 * nu.shape[1] / (nu.shape[1] - 1)
+        bank.white_mg2 += rate * (np.clip(scatter, n.white_lo_mg**2, n.white_hi_mg**2) - bank.white_mg2)
+    push = np.clip((mean_share * (mean_white * mean_white - 1.0)).mean(1), -1.0, 2.0)
+    bank.common_mg2 = np.clip(bank.common_mg2 * np.exp(rate * push), n.common_lo_mg**2, n.common_hi_mg**2)
+    like = np.clip(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
+    longer = np.exp(rate * np.clip(4.0 * (like - 0.1), -1.0, 2.0))
+    bank.disturbance_mg = np.clip(bank.disturbance_mg * longer, n.disturbance_lo_mg, n.disturbance_hi_mg)
