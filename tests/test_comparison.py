@@ -117,7 +117,7 @@ def test_a_vehicle_that_never_turns_gets_no_circle_and_is_told_why():
     got = rows(compare(told(standing), Settings(), earth_model, clock=ticking()))
     for name, row in got.items():
         assert row["state"] != "READY", name
-        if name not in ("kalman", "adaptive"):  # they know no shape and refuse none: the gate does
+        if name not in ("kalman", "adaptive", "twostep"):  # they know no shape and refuse none: the gate does
             assert row["offsets_mg"] is None, name
             assert row["refusal"], name
 

@@ -9,7 +9,7 @@ from magmav.core.estimators.fit import Fit, Refusal
 from magmav.core.types import Shaping, mat3, vec3
 
 ALL = [(m, 2) for m in ALL_2D] + [(m, 3) for m in ALL_3D]
-FITTED = [n for n in ESTIMATORS if n not in ("kalman", "adaptive")]
+FITTED = [n for n in ESTIMATORS if n not in ("kalman", "adaptive", "twostep")]
 NO_ARC = {Refusal.ARC_TOO_SHORT, Refusal.NOT_AN_ELLIPSE, Refusal.NO_ROTATION, Refusal.COLLINEAR, Refusal.PLANAR}
 
 

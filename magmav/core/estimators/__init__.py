@@ -5,6 +5,7 @@ come from. It can be copied at any moment (copy.deepcopy, pickle) and the copy g
 
 kalman           a linear Kalman filter: levelled field constant but for the turning the gyro reports (the default)
 adaptive         a bank of filters over headings and models: also soft iron, drift, throttle (not the default yet)
+twostep          the field's length alone, windowed (Alonso and Shuster 2002): a second opinion without attitude
 minmax           Sawicki 2017, method I: middle of the extremes
 kasa, bullock    methods II and III: the same least-squares circle or sphere, by two sets of equations
 taubin           the same without the pull of short arcs to small circles
@@ -87,9 +88,16 @@ def _adaptive() -> Estimator:
     return AdaptiveEstimator()
 
 
+def _twostep() -> Estimator:
+    from magmav.core.estimators.twostep import TwostepEstimator
+
+    return TwostepEstimator()
+
+
 ESTIMATORS: dict[str, Callable[[], Estimator]] = {
     "kalman": _kalman,
     "adaptive": _adaptive,
+    "twostep": _twostep,
     "minmax": partial(fitted, "minmax"),
     "kasa": partial(fitted, "kasa"),
     "bullock": partial(fitted, "bullock"),
