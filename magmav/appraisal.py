@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.correction import iron_at_throttle
 from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import ZERO3, Heading, Record, Shaping, State, Vec3
+from magmav.core.types import ZERO3, Heading, Record, Shaping, State, Vec3, vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -48,6 +49,7 @@ class CompassLog:
     declination_rad: array[float] = field(default_factory=_doubles)
     sigma_rad: array[float] = field(default_factory=_doubles)
     noise_rad: array[float] = field(default_factory=_doubles)
+    throttle: array[float] = field(default_factory=_doubles)  # NaN where nobody says
     published_s: array[float] = field(default_factory=_doubles)
     published_rad: array[float] = field(default_factory=_doubles)  # magnetic, as smoothed for the wire
     down_mg: float | None = None  # of a two-axis compass: the Earth's downward field that stood in for its third
@@ -78,6 +80,7 @@ class CompassLog:
         self.declination_rad.append(stored_true - stored_magnetic)
         self.sigma_rad.append(record.heading.sigma_rad if record.heading.valid else math.nan)
         self.noise_rad.append(noise_of_heading(record.estimate, record.estimate.horizontal_mg))
+        self.throttle.append(math.nan if record.throttle is None else record.throttle)
         self.published_s.append(record.published_boot_ns / 1e9)
         self.published_rad.append(_angles(record.published)[0] if started else math.nan)
 
@@ -110,7 +113,7 @@ def describe(
         "offsets_change_mg": numbers if known and not absolute else None,
         "relative": last.relative,
         "stored": vehicle.calibrations.stored(compass),
-        "hard_iron_mg": _known(last.estimate.hard_iron_b_mg, last) if absolute else None,
+        "hard_iron_mg": _known(_at_rest(log, vehicle), last) if absolute else None,
         "sigma_mg": [round(float(v), 3) for v in last.sigma_mg] if known else None,
         "sigma_by_motion_mg": own if known else None,
         "axes": [a.value for a in last.verdict.axes],
@@ -150,6 +153,14 @@ def _card(last: Record, vehicle: Vehicle | Boot) -> list[Result]:
     return rows
 
 
+def _at_rest(log: CompassLog, vehicle: Vehicle | Boot) -> Vec3:
+    """The hard iron with the motors off, as far as the throttle says; where nobody says, at the power flown."""
+    if log.last is None or not np.isfinite(log.throttle).any():
+        return ZERO3 if log.last is None else log.last.estimate.hard_iron_b_mg
+    matrix = vehicle.calibrations.shaping(log.last.compass).matrix
+    return vec3(iron_at_throttle(log.last.estimate, matrix, np.zeros(1))[0], "hard iron")
+
+
 def _known(vector: Vec3, last: Record) -> list[float | None]:
     """The vector's numbers, for the axes the method says anything about: not the third of a two-axis compass."""
     return [round(float(v), 3) if says else None for v, says in zip(vector, last.estimate.says_b, strict=True)]
@@ -183,8 +194,9 @@ def scores(
     down = log.down_mg
     if log.last.axes == 2 and down is None:
         left_out["no heading"] = np.ones(len(log), dtype=bool)  # without a dip two axes have none
+    e = log.last.estimate
     calibrations = {
-        "full": Calibration(log.last.estimate.hard_iron_b_mg, log.last.estimate.soft_iron_b @ matrix, down),
+        "full": Calibration(iron_at_throttle(e, matrix, np.array(log.throttle)), e.soft_iron_b @ matrix, down),
         "offsets": Calibration(-offsets, matrix, down),
     }
     stored = vehicle.calibrations.offsets(log.last.compass)

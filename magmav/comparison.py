@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from magmav.core import gate
 from magmav.core.channel import SIGMA_FLOOR_MG, Channel, Circumstances
+from magmav.core.correction import iron_at_throttle
 from magmav.core.dip import dip_from_model
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.field import ExpectedField
@@ -79,6 +80,7 @@ class Columns:
     axes: int
     expected: ExpectedField | None  # at the end
     declination_rad: Floats  # NaN where no position was known
+    throttle: Floats  # NaN where nobody says
 
     @classmethod
     def of(cls, heard: Sequence[Heard]) -> Columns:
@@ -99,6 +101,7 @@ class Columns:
             samples[-1].axes,
             expected[-1],
             np.array([math.nan if e is None else e.declination_rad for e in expected]),
+            np.array([math.nan if s.throttle is None else s.throttle for s in samples]),
         )
 
     def down_mg(self, radius_mg: float) -> float | None:
@@ -297,7 +300,8 @@ def _calibrations(
         e: Estimate | None = getattr(o, which)
         if e is not None:
             down = columns.down_mg(e.horizontal_mg)
-            out[o.name] = Calibration(e.hard_iron_b_mg, e.soft_iron_b @ matrix, down)
+            iron = iron_at_throttle(e, matrix, columns.throttle)
+            out[o.name] = Calibration(iron, e.soft_iron_b @ matrix, down)
     return out
 
 
@@ -344,7 +348,8 @@ def _row(
     row |= _both(second, whole)
     if e is None:
         return row
-    corrected = (columns.sensor_b_mg[columns.learn] - e.hard_iron_b_mg) @ (e.soft_iron_b @ matrix).T
+    iron = iron_at_throttle(e, matrix, columns.throttle[columns.learn])
+    corrected = (columns.sensor_b_mg[columns.learn] - iron) @ (e.soft_iron_b @ matrix).T
     length = np.linalg.norm(corrected, axis=1)
     row["offsets_mg"] = _said(-e.hard_iron_b_mg, e)
     row["sigma_mg"] = _said(gate.floored(e, SIGMA_FLOOR_MG), e) if o.has_sigma else None

@@ -9,6 +9,7 @@ Live, replay and simulation run this and nothing else. It has no clock and no li
 from __future__ import annotations
 
 from magmav.core.estimators import ESTIMATORS
+from magmav.core.published import Publisher
 from magmav.core.types import FieldModel, Reading, Record
 from magmav.settings import Settings
 from magmav.vehicle import Tap, Vehicle
@@ -26,7 +27,9 @@ class Pipeline:
         self._model = model
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
-        ESTIMATORS[settings.learn.estimator]()  # its libraries take seconds to load: now, not at the first sample
+        # Their libraries take seconds to load: now, not at the first sample.
+        ESTIMATORS[settings.learn.estimator]()
+        Publisher(settings.heading.smooth, settings.heading.lag)
 
     def apply(self, settings: Settings) -> None:
         """Settings changed in flight: what is learnt stays."""

@@ -228,6 +228,7 @@ class Vehicle:
             axes=axes,
             published=published,
             published_boot_ns=published_ns,
+            throttle=sample.throttle,
         )
         return record
 

@@ -29,6 +29,7 @@ _POWER = {AMPERE: 10.0, THROTTLE: 200.0}  # mG per ampere, and per full throttle
 _DRIFT = math.radians(2.0)  # rad/s
 _HOP = math.radians(4.0)  # what the gyro may lose from block to block beyond a constant drift: scale, walk
 _TILT = math.radians(0.3)  # what the attitude's slow error leaves in the turn, however long the flight
+_TILT_SIGMA = math.radians(0.5)
 _LEAST_MG = 3.0  # no fit is believed to be better than this
 _STEPS, _DONE = 14, 0.01  # Gauss-Newton stops when no unknown moves by more of its sigma
 _BETTER = 60.0  # by so much, in chi-squared, a right-angled mounting must beat none
@@ -113,6 +114,7 @@ class Fit:
     rms_mg: float
     plain_mg: float
     samples: int
+    plain_cov: Array
 
     def sigma(self, which: int) -> float:
         """One sigma of one of the shared unknowns."""
@@ -272,6 +274,29 @@ class _State:
         return out
 
 
+def _tilted(p: _Problem, state: _State, gain: Array) -> Array:
+    """What a tilt that errs for as long as a block lasts adds to the covariance, (P, P).
+
+    Turned by e about a level axis, g and the other level axis change places: e D (v q - h sin(a) g), and likewise with
+    p. Each block's error goes its own way. gain : (P, P), the change of the answer by that of the right side.
+    """
+    j, d = p.blocks, state.matrix()
+    by, weights = state.derivatives(p.power_by), state.weights()
+    out = np.zeros_like(gain)
+    for level in (1, 2):
+        swapped = np.zeros_like(weights)
+        swapped[:, level], swapped[:, 0] = weights[:, 0], -weights[:, level]
+        field = np.zeros((j, FEATURES, 3))
+        field[:, :TOP] = np.einsum("jc,rs->jcsr", swapped, d).reshape(j, TOP, 3)
+        pull = np.einsum("jpfr,jfr->jp", by, p.x @ field)
+        side = np.zeros((len(gain), j))
+        side[:SHARED] = pull[:, :SHARED].T
+        side[SHARED:][range(j), range(j)] = pull[:, SHARED]
+        moved = gain @ side
+        out += _TILT_SIGMA**2 * moved @ moved.T
+    return out
+
+
 def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
     """Information (P, P) and right side (P,) of what is known beforehand, P = SHARED + J."""
     j = p.blocks
@@ -343,6 +368,8 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
         if float(np.abs(step / np.sqrt(np.diag(covariance))).max()) < _DONE:
             break
     x = state.shared
+    plain_cov = covariance[TURN, TURN] + np.eye(3) * _TILT**2
+    covariance += _tilted(p, state, covariance / worth)
     covariance[TURN, TURN] += np.eye(3) * _TILT**2
     return Fit(
         gain=float(x[GAIN]),
@@ -361,6 +388,7 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
         rms_mg=math.sqrt(max(p.misfit(theta), 0.0) / (3.0 * p.n)),
         plain_mg=math.sqrt(max(plain, 0.0) / (3.0 * p.n)),
         samples=round(p.n),
+        plain_cov=plain_cov,
     )
 
 

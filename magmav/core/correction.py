@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magmav.core.dip import dip_from_model
 from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
@@ -20,12 +21,24 @@ _WEAKEST_MG = 20.0  # a circle smaller than this is none
 
 
 def corrected_field(s: Sample, e: Estimate, expected: ExpectedField | None) -> Vec3:
-    """soft iron (A (m - b) + motor), (3,) mG, body axes. Of a two-axis compass the third is reckoned from the dip.
+    """soft iron (A (m - b) + motor), (3,) mG, body axes, b at this throttle. Of two axes the third comes from the dip.
 
     Where that cannot be (no position, or beyond 60 degrees of tilt) it is 0.
     """
-    field: Vec3 = e.soft_iron_b @ (s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg)
+    field: Vec3 = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
+    if s.throttle is not None:
+        field = field - (s.throttle - e.throttle_mean) * e.throttle_b_mg
+    field = e.soft_iron_b @ field
     return field if s.axes == 3 else with_third(field, s, _radius(e, expected), expected)
+
+
+def iron_at_throttle(e: Estimate, matrix: Mat3, throttle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The hard iron with the motors at each throttle, (N,) to (N, 3) mG, the sensor's axes; NaN: at mean power.
+
+    matrix : the autopilot's own, (3, 3), which what the motors add does not go through.
+    """
+    away = np.where(np.isfinite(throttle), throttle - e.throttle_mean, 0.0)
+    return np.asarray(e.hard_iron_b_mg + away[:, None] * np.linalg.solve(matrix, e.throttle_b_mg))
 
 
 def iron_of_offsets(s: Sample, e: Estimate, expected: ExpectedField | None) -> Vec3:

@@ -13,17 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from magmav.core.marg_attitude import Carried, MargAttitude
+from magmav.core.own_frame import Frame, Vector, carried, levelled, matrix, of_attitude, stepped
 from magmav.core.rotation import (
     body_from_earth,
     cross_matrix,
     euler_rates,
     level_from_body,
-    rotation,
-    shortest_turn,
     tilt_from_force,
     wrap_pi,
 )
-from magmav.core.types import IDENTITY3, ZERO3, AttitudeReading, InertialReading, Mat3, Vec3
+from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Mat3, Vec3
 
 _FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
 _RATES_HOLD_S = 0.25  # between attitudes further apart, rates say nothing: take the yaw step itself
@@ -49,6 +48,17 @@ class MotionState(NamedTuple):
     body_from_own: Mat3  # from a frame level with the earth that the gyro carries along; good at every attitude
 
 
+class _Heard(NamedTuple):
+    """One attitude, with what was integrated up to it."""
+
+    boot_ns: int
+    reading: AttitudeReading
+    rate_b_rads: Vector
+    euler_rads: Vector  # rates of roll, pitch and yaw
+    yaw_rad: float
+    own_frame: Frame
+
+
 class Motion:
     """Keeps the latest tilt of one vehicle.
 
@@ -57,11 +67,8 @@ class Motion:
 
     def __init__(self, own: str = "complementary") -> None:
         self.seen_attitude = False
-        self._att: AttitudeReading | None = None
-        # With the integrated yaw, and the own frame.
-        self._recent: deque[tuple[AttitudeReading, float, Mat3]] = deque(maxlen=12)
-        self._own_frame: Mat3 = IDENTITY3
-        self._yaw_rad = 0.0
+        self._last: _Heard | None = None
+        self._recent: deque[_Heard] = deque(maxlen=12)
         self._epoch = 0
         if own not in OWN_TILTS:
             raise ValueError(f"own: want one of {', '.join(OWN_TILTS)}, got {own!r}")
@@ -70,48 +77,44 @@ class Motion:
             self._own = MargAttitude("gn" if own == "marg_gn" else "gd")
 
     def attitude(self, r: AttitudeReading) -> bool:
-        """Take one attitude; False when it is a duplicate or late."""
-        last = self._att
+        """Take one attitude; False when it is a duplicate or late.
+
+        Turning about the vertical comes from the gyro alone (over long gaps from the attitude's own step). The own
+        frame is turned on by the gyro, then made level with the attitude by the shortest way: no angle is singular,
+        and a tail-sitter standing on its tail is like any other.
+        """
+        last = self._last
         if last is not None and r.boot_ns <= last.boot_ns:
             return False
-        self._carry_frame(last, r)
-        if last is not None:
-            dt = (r.boot_ns - last.boot_ns) / 1e9
-            if dt <= _RATES_HOLD_S:
-                before = euler_rates(last.roll_rad, last.pitch_rad, last.rate_b_rads)[2]
-                after = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)[2]
-                self._yaw_rad += 0.5 * (before + after) * dt
-            elif dt <= _LOST_S:
-                self._yaw_rad += wrap_pi(r.yaw_rad - last.yaw_rad)
+        x, y, z = r.rate_b_rads.tolist()
+        euler = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)
+        dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
+        if last is None:
+            yaw, frame = 0.0, of_attitude(r.roll_rad, r.pitch_rad, r.yaw_rad)
+        elif dt <= _RATES_HOLD_S:
+            yaw = last.yaw_rad + 0.5 * (last.euler_rads[2] + euler[2]) * dt
+            p, q, w = last.rate_b_rads
+            frame = carried(last.own_frame, (0.5 * (p + x), 0.5 * (q + y), 0.5 * (w + z)), dt)
+            frame = levelled(frame, r.roll_rad, r.pitch_rad)
+        else:
+            was, now = last.reading, of_attitude(r.roll_rad, r.pitch_rad, r.yaw_rad)
+            yaw, frame = last.yaw_rad, now
+            if dt <= _LOST_S:
+                yaw += wrap_pi(r.yaw_rad - was.yaw_rad)
+                frame = stepped(last.own_frame, of_attitude(was.roll_rad, was.pitch_rad, was.yaw_rad), now)
             else:
                 self._epoch += 2
                 self._recent.clear()
-        self._att, self.seen_attitude = r, True
-        self._recent.append((r, self._yaw_rad, self._own_frame))
+        self._last = _Heard(r.boot_ns, r, (x, y, z), euler, yaw, frame)
+        self._recent.append(self._last)
+        self.seen_attitude = True
         return True
-
-    def _carry_frame(self, last: AttitudeReading | None, r: AttitudeReading) -> None:
-        """The own frame at this attitude: turned on by the gyro, then made level with it by the shortest way.
-
-        Turning about the vertical comes from the gyro alone (over long gaps from the attitude's own step), and no
-        angle is singular: a tail-sitter standing on its tail is like any other.
-        """
-        now = body_from_earth(r.roll_rad, r.pitch_rad, r.yaw_rad)
-        dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
-        if last is None or dt > _LOST_S:
-            self._own_frame = now
-        elif dt <= _RATES_HOLD_S:
-            carried = rotation(-0.5 * dt * (last.rate_b_rads + r.rate_b_rads)) @ self._own_frame
-            self._own_frame = shortest_turn(carried[:, 2], now[:, 2]) @ carried
-        else:
-            before = body_from_earth(last.roll_rad, last.pitch_rad, last.yaw_rad)
-            self._own_frame = now @ before.T @ self._own_frame
 
     def inertial(self, r: InertialReading) -> None:
         """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
-        a = self._att
-        if a is not None and r.boot_ns - a.boot_ns <= _FRESH_NS:
-            self._own.seed(a)
+        last = self._last
+        if last is not None and r.boot_ns - last.boot_ns <= _FRESH_NS:
+            self._own.seed(last.reading)
         else:
             self._own.step(r)
 
@@ -130,22 +133,20 @@ class Motion:
     @property
     def rate_rads(self) -> float:
         """Length of the newest body rate, rad/s, 0 when nothing is known."""
-        a = self._att
-        return math.hypot(*(self._own.rate_b_rads if a is None else a.rate_b_rads))
+        last = self._last
+        return math.hypot(*(self._own.rate_b_rads.tolist() if last is None else last.rate_b_rads))
 
     def at(self, boot_ns: int) -> MotionState | None:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
-        a = self._att
-        if a is not None and abs(boot_ns - a.boot_ns) <= _FRESH_NS:
-            yaw, frame = self._yaw_rad, self._own_frame
-            for earlier, its_yaw, its_frame in reversed(self._recent):
-                if abs(earlier.boot_ns - boot_ns) > abs(a.boot_ns - boot_ns):
+        heard = self._last
+        if heard is not None and abs(boot_ns - heard.boot_ns) <= _FRESH_NS:
+            for earlier in reversed(self._recent):
+                if abs(earlier.boot_ns - boot_ns) > abs(heard.boot_ns - boot_ns):
                     break
-                a, yaw, frame = earlier, its_yaw, its_frame
-            age = (boot_ns - a.boot_ns) / 1e9
-            dr, dp, dy = euler_rates(a.roll_rad, a.pitch_rad, a.rate_b_rads)
-            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, yaw + dy * age
-            frame = rotation(-age * a.rate_b_rads) @ frame
+                heard = earlier
+            a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
+            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, heard.yaw_rad + dy * age
+            frame = matrix(carried(heard.own_frame, heard.rate_b_rads, age))
             return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame)
         own = self._own.at(boot_ns)
         if own is None:

@@ -36,19 +36,23 @@ class Publisher:
 
     def restart(self) -> None:
         """Begin anew: what comes next is not the same story."""
-        self._live = HeadingFilter()
-        self._late = FixedLagSmoother(self.lag)
+        self._by: HeadingFilter | FixedLagSmoother | None = None
+        if self.smoothing == "kalman":
+            self._by = HeadingFilter()
+        elif self.smoothing == "fixed_lag":
+            self._by = FixedLagSmoother(self.lag)
 
     def step(self, boot_ns: int, heading: Heading, noise_rad: float) -> tuple[Heading, int]:
         """The heading to publish and the boot time it belongs to. Where there is none yet, it is not valid."""
-        if self.smoothing == "off":
+        by = self._by
+        if by is None:
             return heading, boot_ns
         if not heading.valid:
             self.restart()
             return UNKNOWN, boot_ns
-        if self.smoothing == "kalman":
-            return self._as(self._live.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad), heading)
-        final = self._late.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad)
+        if isinstance(by, HeadingFilter):
+            return self._as(by.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad), heading)
+        final = by.step(boot_ns / 1e9, heading.magnetic_rad, noise_rad)
         if not final or boot_ns / 1e9 - final[-1].boot_s > _OLDEST_S:
             return UNKNOWN, boot_ns
         return self._as(final[-1], heading)

@@ -58,7 +58,7 @@ def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float
 
 def euler_rates(roll_rad: float, pitch_rad: float, rate_b_rads: NDArray[np.float64]) -> tuple[float, float, float]:
     """Rates of roll, pitch and yaw from body rates, rad/s. Near +-90 degrees of pitch the cosine is held at 0.05."""
-    p, q, r = rate_b_rads
+    p, q, r = rate_b_rads.tolist()  # plain numbers: numpy's own are slow one by one
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
     cp = math.cos(pitch_rad)
     cp = math.copysign(max(abs(cp), 0.05), cp)
@@ -68,7 +68,7 @@ def euler_rates(roll_rad: float, pitch_rad: float, rate_b_rads: NDArray[np.float
 
 def tilt_from_force(force_b: NDArray[np.float64]) -> tuple[float, float] | None:
     """Roll and pitch from specific force, rad; None in free fall (seed-methods.md section 0)."""
-    fx, fy, fz = force_b
+    fx, fy, fz = force_b.tolist()
     if fx * fx + fy * fy + fz * fz < 1e-6:
         return None
     return math.atan2(-fy, -fz), math.atan2(fx, math.hypot(fy, fz))
@@ -93,16 +93,4 @@ def rotation(turn_rad: NDArray[np.float64]) -> Mat3:
     cross = cross_matrix(x, y, z)
     first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
     out: Mat3 = np.eye(3) + first * cross + second * (cross @ cross)
-    return out
-
-
-def shortest_turn(one: NDArray[np.float64], other: NDArray[np.float64]) -> Mat3:
-    """The smallest rotation that takes the unit vector ``one`` to ``other``, (3, 3); none where they are opposite."""
-    (ax, ay, az), (bx, by, bz) = one.tolist(), other.tolist()
-    c = ax * bx + ay * by + az * bz
-    if c < -0.999:
-        return np.eye(3)
-    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    cross = cross_matrix(x, y, z)
-    out: Mat3 = np.eye(3) + cross + cross @ cross / (1.0 + c)
     return out

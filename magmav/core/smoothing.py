@@ -13,10 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from magmav.core.azimuth import finite
@@ -71,12 +70,19 @@ def _smoothed(boot_s: float, x: Array, variance: float) -> Smoothed:
     return Smoothed(boot_s, wrap_tau(float(x[0])), float(x[1]), math.sqrt(max(variance, 0.0)))
 
 
+def _kalman_filter(states: int, measures: int) -> Any:
+    """filterpy's. It takes a second to load: only who smooths shall wait for it."""
+    from filterpy.kalman import KalmanFilter
+
+    return KalmanFilter(dim_x=states, dim_z=measures)
+
+
 class HeadingFilter:
     """Kalman filter of heading and turn rate, live. A copy or pickle of it goes on to the same bits."""
 
     def __init__(self, motion: Motion | None = None) -> None:
         self.motion = motion or Motion()
-        self._filter = KalmanFilter(dim_x=2, dim_z=1)
+        self._filter = _kalman_filter(2, 1)
         self._filter.H = np.array([[1.0, 0.0]])
         self._boot_s: float | None = None
 
@@ -227,7 +233,7 @@ class ChannelFilter:
     def __init__(self, sigma_mg: float, factor: float = 2.5) -> None:
         if not (math.isfinite(sigma_mg) and sigma_mg > 0.0):
             raise ValueError(f"sigma_mg: want a number above 0, got {sigma_mg!r}")
-        self._filter = KalmanFilter(dim_x=2, dim_z=2)
+        self._filter = _kalman_filter(2, 2)
         self._filter.H = np.eye(2)
         self._filter.R = np.eye(2) * sigma_mg**2
         self._filter.Q = self._filter.R * noise_reduction(factor)[1]

@@ -42,8 +42,9 @@ class Codec:
         self._mav = dialect.MAVLink(None)
         self._rest: dict[str, bytes] = {}
         self._sequence: dict[tuple[int, int], int] = {}
-        ids = dialect.mavlink_map
-        self._wanted = None if wanted is None else {i for i, kind in ids.items() if kind.msgname in wanted}
+        kinds = dialect.mavlink_map.items()
+        self._seeds = {i: bytes((kind.crc_extra,)) for i, kind in kinds}  # the last byte of each message's checksum
+        self._wanted = {i for i, kind in kinds if wanted is None or kind.msgname in wanted}
 
     def decode(self, data: bytes, route: str, *, whole: bool) -> list[Message]:
         """Messages completed by these bytes. ``whole``: a datagram, nothing is carried over to the next.
@@ -55,9 +56,10 @@ class Codec:
         out: list[Message] = []
         at, end = 0, len(data)
         while at < end:
-            start = _next_magic(data, at)
-            self.counts["garbage bytes"] += start - at
-            at = start
+            if data[at] != _V2 and data[at] != _V1:
+                start = _next_magic(data, at)
+                self.counts["garbage bytes"] += start - at
+                at = start
             size = _frame_size(data, at)
             if size == 0 or at + size > end:
                 if not whole and end - at < _LONGEST and at < end:
@@ -80,18 +82,18 @@ class Codec:
 
     def _frame(self, frame: bytes, out: list[Message]) -> bool:
         v2 = frame[0] == _V2
-        number = int.from_bytes(frame[7:10], "little") if v2 else frame[5]
-        kind = dialect.mavlink_map.get(number)
-        if kind is None:
+        number = frame[7] | frame[8] << 8 | frame[9] << 16 if v2 else frame[5]
+        seed = self._seeds.get(number)
+        if seed is None:
             # No checksum seed, so nothing proves this is a frame: step one byte and look again.
             self.counts["unknown"] += 1
             return False
         tail = 15 if v2 and frame[2] & _SIGNED else 2
         body = len(frame) - tail
-        if crc16.mcrf4xx(frame[1:body] + bytes((kind.crc_extra,))) != int.from_bytes(frame[body : body + 2], "little"):
+        if crc16.mcrf4xx(frame[1:body] + seed) != frame[body] | frame[body + 1] << 8:
             self.counts["bad crc"] += 1
             return False
-        if self._wanted is not None and number not in self._wanted:
+        if number not in self._wanted:
             self.counts["skipped"] += 1
             return True
         try:

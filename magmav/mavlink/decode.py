@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from magmav.core.rotation import euler_from_quaternion
 from magmav.core.types import (
@@ -126,13 +126,14 @@ class Decoder:
             return out
         # Some ArduPilot builds send mG times 1000 and call it gauss: a million times too much (autopilots.md 1.2).
         scale = 1e3 if math.hypot(*gauss) <= 10.0 else 1e-3
-        out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, _within(_MOST_MG, gauss * scale, "field")))
+        x, y, z = (gauss * scale).tolist()
+        out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, _within(_MOST_MG, (x, y, z), "field")))
         return out
 
     def _attitude(self, m: Message, system: int) -> list[Reading]:
         rate = _within(_MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
-        angles = _within(_MOST_RAD, (m.roll, m.pitch, m.yaw), "attitude")
-        roll, pitch, yaw = (float(a) for a in angles)
+        roll, pitch, yaw = angles = m.roll, m.pitch, m.yaw
+        _bounded(_MOST_RAD, angles, "attitude")
         return [AttitudeReading(system, "ATTITUDE", m.time_boot_ms * _MS, roll, pitch, yaw, rate)]
 
     def _quaternion(self, m: Message, system: int) -> list[Reading]:
@@ -195,9 +196,17 @@ class Decoder:
         return [ParamReading(system, component, m.param_id, m.param_value, m.param_index, m.param_count)]
 
 
-def _within(most: float, value: Iterable[float], name: str) -> Vec3:
+def _within(most: float, value: tuple[float, float, float], name: str) -> Vec3:
     """The vector (3,); ValueError when it is not finite, OverflowError when an entry is larger than ``most``."""
-    out = vec3(tuple(value), name)
-    if max(map(abs, out)) > most:
+    _bounded(most, value, name)
+    return vec3(value, name)
+
+
+def _bounded(most: float, value: tuple[float, float, float], name: str) -> None:
+    """ValueError for a number that is not finite, OverflowError for one larger than ``most``."""
+    x, y, z = value
+    if -most <= x <= most and -most <= y <= most and -most <= z <= most:
+        return
+    if all(map(math.isfinite, value)):
         raise OverflowError(name)
-    return out
+    raise ValueError(name)

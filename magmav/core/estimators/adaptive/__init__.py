@@ -44,12 +44,15 @@ class AdaptiveEstimator:
         self._change = ChangeWatch(self.tuning)
         self._own_yaw_rad = 0.0
         self._lost = False
+        self._by_hand = False
         self._drive = 0.0  # mean of what k is multiplied with
+        self._driven = 0
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
         self._nis = 1.0
         self._axes = 3
+        self._matrix: Array = _EYE3
         self._model_mg: tuple[float, float] | None = None
 
     # ------------------------------------------------------------ time
@@ -73,11 +76,17 @@ class AdaptiveEstimator:
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
         if self._wild.step(z, math.hypot(*s.rate_b_rads.tolist()) * dt):
             return
-        drive = 0.0 if s.throttle is None else s.throttle - 0.5
         self._samples += 1
-        self._drive += (drive - self._drive) / min(self._samples, 2000)
+        drive = self._drive
+        if s.throttle is not None:
+            drive = s.throttle - 0.5
+            self._driven = min(self._driven + 1, 2000)
+            self._drive += (drive - self._drive) / self._driven
         if self._bank is None:
             self._bank = Bank.begun(self._prior(s, z, down_b), n)
+        if self._by_hand and not s.by_hand:
+            self._leave_ground(s, z, down_b)
+        self._by_hand = s.by_hand
         if self._model_mg is None and s.model_mg is not None:
             self._model_mg = s.model_mg
             self._bank.tell_field(*s.model_mg, n)
@@ -91,6 +100,16 @@ class AdaptiveEstimator:
         if s.model_mg is not None:
             return s.model_mg[0], n.model_mg, s.model_mg[1], n.model_mg
         return (*n.blind_h_mg, float(z @ down_b), n.blind_v_mg)
+
+    def _leave_ground(self, s: Sample, z: Array, down_b: Array) -> None:
+        """What stood about it while it was turned by hand does not fly along: only where the iron is about stays."""
+        if len(self._gathering):
+            self._learn()
+        assert self._bank is not None
+        iron_mg = self._bank.mixture()[0][at.B]
+        self._bank = Bank.begun(self._prior(s, z, down_b), self.tuning, iron_mg)
+        self._gathering = Gathering()
+        self._samples = self._blocks = self._residual_n = 0
 
     # ------------------------------------------------------------ learning
 
@@ -110,7 +129,7 @@ class AdaptiveEstimator:
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
-        self._axes = k
+        self._axes, self._matrix = k, block.shaping.matrix
         if self._equation.shape != (count, size):
             self._equation = Equation(count, size)
         y, j, u = self._equation(bank.x, block)
@@ -160,7 +179,7 @@ class AdaptiveEstimator:
         mean, covariance = self._bank.mixture()
         soft = _EYE3 + soft_matrix(mean[at.S])
         take = np.zeros((3, at.SIZE))  # iron at mean throttle
-        take[:, at.B], take[:, at.K] = _EYE3, self._drive * _EYE3
+        take[:, at.B], take[:, at.K] = _EYE3, self._drive * np.linalg.inv(self._matrix)
         own = covariance
         if self._model_mg is not None:
             own = without_prior(covariance, *self._model_mg, self.tuning)
@@ -177,6 +196,8 @@ class AdaptiveEstimator:
             delay_s=float(mean[at.T]),
             soft_iron_b=mat3(np.linalg.inv(soft), "soft iron"),
             says_b=(True, True, self._axes == 3),
+            throttle_b_mg=vec3(mean[at.K], "throttle"),
+            throttle_mean=self._drive + 0.5,
         )
 
 

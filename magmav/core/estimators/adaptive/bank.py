@@ -11,7 +11,8 @@ from magmav.core.estimators.adaptive.layout import Array, Index
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import TAU
 
-_COLUMNS = tuple("x p model log_weight prior walk_mg white_mg2 common_mg2 disturbance_mg square product last".split())
+_COLUMNS: tuple[str, ...] = ("x", "p", "model", "log_weight", "prior", "walk_mg")
+_COLUMNS += ("white_mg2", "common_mg2", "disturbance_mg", "square", "product", "last")
 
 
 def field_covariance(h_mg: float, v_mg: float, n: Tuning) -> Array:
@@ -37,8 +38,11 @@ class Bank:
         self.prior = np.log([MODELS[m].weight for m in model])
 
     @staticmethod
-    def begun(field: tuple[float, float, float, float], n: Tuning) -> Bank:
-        """One filter per heading and model. field: mean and sigma of H and of V, mG."""
+    def begun(field: tuple[float, float, float, float], n: Tuning, iron_mg: Array | None = None) -> Bank:
+        """One filter per heading and model. field: mean and sigma of H and of V, mG.
+
+        iron_mg : (3,) where the iron may be looked for first; it may be n.ground_mg off.
+        """
         h, h_sigma, v, v_sigma = field
         k = n.yaws * len(MODELS)
         x, p = np.zeros((k, at.SIZE)), np.zeros((k, at.SIZE, at.SIZE))
@@ -48,6 +52,9 @@ class Bank:
         diagonal = p.reshape(k, -1)[:, :: at.SIZE + 1]
         diagonal[:, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
         diagonal[:, at.B] = n.prior_iron_mg**2
+        if iron_mg is not None:
+            x[:, at.B] = iron_mg
+            diagonal[:, at.B] = n.ground_mg**2
         diagonal[:, at.H], diagonal[:, at.V] = h_sigma**2, v_sigma**2
         p[:, at.H : at.V + 1, at.H : at.V + 1] += field_covariance(h, v, n) - n.model_mg**2 * np.eye(2)
         diagonal[:, at.E] = n.tilt_rad**2
@@ -75,6 +82,13 @@ class Bank:
         self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
         self.x[:, at.E] = self.p[:, at.E, :] = self.p[:, :, at.E] = 0.0  # it was about axes that are lost
         np.einsum("kii->ki", self.p)[:, at.E] = n.tilt_rad**2
+
+    def doubt_iron(self, sigma_mg: float) -> None:
+        """What was learnt of the iron may be off by so much more; the disturbance is part of it from now on."""
+        self.x[:, at.B] += self.x[:, at.D]
+        self.x[:, at.D] = 0.0
+        diagonal = np.einsum("kii->ki", self.p)
+        diagonal[:, at.B] += sigma_mg**2
 
     def tell_field(self, h_mg: float, v_mg: float, n: Tuning) -> None:
         """The world model's field, once a position is known: a measurement of H and V."""

@@ -54,11 +54,6 @@ class ChangeWatch:
 
     def open(self, bank: Bank) -> None:
         """Let the iron move: what is known of field, heading and soft iron stays, so it is soon found again."""
-        taken = bank.x[:, at.D]
-        seen = max(float(np.linalg.norm(self._innovation_mg)), float(np.abs(taken).max(initial=0.0)))
-        jump = max(_LEAST_MG, _SHARE * seen)
-        bank.x[:, at.B] += taken
-        bank.x[:, at.D] = 0.0
-        diagonal = bank.p.reshape(len(bank), -1)[:, :: at.SIZE + 1]
-        diagonal[:, at.B] += jump**2
-        diagonal[:, at.ALPHA] += _TURN_RAD**2
+        seen = max(float(np.linalg.norm(self._innovation_mg)), float(np.abs(bank.x[:, at.D]).max(initial=0.0)))
+        bank.doubt_iron(max(_LEAST_MG, _SHARE * seen))
+        np.einsum("kii->ki", bank.p)[:, at.ALPHA] += _TURN_RAD**2

@@ -3,7 +3,8 @@
     A m + e = A b + (I + S)(u + (R_bo e_tilt + r + kappa t) x u + tau w x u) + k (throttle - 1/2) + d + noise
     u = R_bo (H cos a, H sin a, V),   a = alpha - g . (integral of down since the sample)
 R_bo takes the own frame to body axes; t is the vehicle's tilt as a rotation, r that of the mounting; w the body rate.
-It holds the norm, the dip, the turning and the world model, each with its own direction. Angles of attitude appear nowhere: no gimbal.
+It holds the norm, the dip, the turning and the world model, each with its own direction. Angles of attitude appear
+nowhere: no gimbal.
 """
 
 from __future__ import annotations

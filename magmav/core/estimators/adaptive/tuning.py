@@ -28,6 +28,7 @@ class Tuning:
 
     yaws: int = 12
     prior_iron_mg: float = 300.0
+    ground_mg: float = 100.0  # what was learnt by hand may be off by so much in flight
     model_mg: float = 5.0  # of the world model, per component
     blind_h_mg: tuple[float, float] = (230.0, 80.0)  # without a position: mean and sigma
     blind_v_mg: float = 200.0
@@ -36,7 +37,7 @@ class Tuning:
     white_mg: float = 5.0  # one reading's own noise at first, and its limits
     white_lo_mg: float = 2.0
     white_hi_mg: float = 15.0
-    common_mg: float = 8.0  # of what all readings of a block share: structure that no state stands for
+    common_mg: float = 12.0  # of what all readings of a block share: structure that no state stands for
     common_lo_mg: float = 1.0
     common_hi_mg: float = 30.0
     adapt_after: int = 5  # blocks
@@ -44,12 +45,12 @@ class Tuning:
     adapt_first_s: float = 2.0
     sync_s: float = 0.02
     tilt_rad: float = math.radians(1.0)
-    tilt_tau_s: float = 12.0
+    tilt_tau_s: float = 15.0
     own_tilt_rad: float = math.radians(6.0)  # of gyro and accelerometer alone, misled by every acceleration
     own_tilt_tau_s: float = 6.0
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
-    disturbance_hi_mg: float = 6.0
+    disturbance_hi_mg: float = 7.0
     disturbance_tau_s: float = 1.0
     throttle_mg: float = 60.0
     gyro_rads: float = math.radians(0.6)
