@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.core import gate
-from magmav.core.channel import SIGMA_FLOOR_MG, Channel, Circumstances
+from magmav.core.channel import Circumstances
 from magmav.core.correction import iron_at_throttle
 from magmav.core.dip import dip_from_model
 from magmav.core.estimators import ESTIMATORS, Estimator
@@ -30,7 +30,7 @@ from magmav.recording import Keeper, NothingToLearnFrom, play
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle, limits
+from magmav.vehicle import Boot, Vehicle, new_channel
 
 Floats = NDArray[np.float64]
 Result = dict[str, Any]
@@ -155,7 +155,7 @@ def try_estimator(
         made.append(_Timed(ESTIMATORS[name](), clock))
         return made[-1]
 
-    channel = Channel(make, limits(settings), settings.gate.steady_s)
+    channel = new_channel(settings, name, make)
     first: Estimate | None = None
     for index, (sample, circumstances) in enumerate(heard):
         if index == half:
@@ -352,7 +352,7 @@ def _row(
     corrected = (columns.sensor_b_mg[columns.learn] - iron) @ (e.soft_iron_b @ matrix).T
     length = np.linalg.norm(corrected, axis=1)
     row["offsets_mg"] = _said(-e.hard_iron_b_mg, e)
-    row["sigma_mg"] = _said(gate.floored(e, SIGMA_FLOOR_MG), e) if o.has_sigma else None
+    row["sigma_mg"] = _said(gate.floored(e), e) if o.has_sigma else None
     row["soft_iron"] = None if np.array_equal(e.soft_iron_b, np.eye(3)) else e.soft_iron_b.round(4).tolist()
     row["residual_mg"] = round(e.residual_mg, 2)
     row["length_rms_mg"] = round(float(length.std()), 2) if len(length) and all(e.says_b) else None

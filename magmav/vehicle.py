@@ -15,7 +15,7 @@ from magmav.core.assemble import Assembler
 from magmav.core.causes import Causes
 from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.correction import without_third
-from magmav.core.estimators import ESTIMATORS
+from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
@@ -311,8 +311,7 @@ class Vehicle:
 
     def _channel(self, compass: int) -> Channel:
         if compass not in self.channels:
-            make = ESTIMATORS[self.settings.learn.estimator]
-            self.channels[compass] = Channel(make, limits(self.settings), self.settings.gate.steady_s)
+            self.channels[compass] = new_channel(self.settings)
         return self.channels[compass]
 
     def settle(self, compass: int) -> None:
@@ -354,6 +353,7 @@ class Vehicle:
             parameters_changed=held.changed(compass),
             grounded=self._unflown() and not self.settings.learn.on_ground,
             frozen_s=self.assembler.frozen_s(compass),
+            stored_b_mg=held.offsets(compass),
         )
 
     def _after_reboot(self) -> None:
@@ -382,6 +382,16 @@ class Vehicle:
 def _books() -> dict[int, StoredCalibrations]:
     """One of each kind: parameters may be heard before the heartbeat that says whose they are."""
     return {_ARDUPILOT: Calibrations(), _PX4: Px4Calibrations()}
+
+
+def new_channel(settings: Settings, name: str | None = None, make: Callable[[], Estimator] | None = None) -> Channel:
+    """One compass's channel. The adaptive estimator has a second opinion.
+
+    name : of the estimator, instead of that in the settings.  make : makes it, instead of ESTIMATORS.
+    """
+    name = name or settings.learn.estimator
+    second = ESTIMATORS["twostep"] if name == "adaptive" else None
+    return Channel(make or ESTIMATORS[name], limits(settings), settings.gate.steady_s, second)
 
 
 def limits(settings: Settings) -> gate.Limits:

@@ -184,8 +184,8 @@ def test_an_axis_from_the_model_is_enough_for_ready():
 
 
 def test_claimed_sigma_adds_the_floor_in_quadrature_and_survives_a_negative_variance():
-    estimate = replace(GOOD, covariance_mg2=np.diag([4.0, 0.0, -1e-9]))
-    assert floored(estimate, (1.5, 1.5, 5.0)) == pytest.approx([2.5, 1.5, 5.0])
+    estimate = replace(GOOD, covariance_mg2=np.diag([4.0, 0.0, -1e-9]), floor_mg=(1.5, 1.5, 5.0))
+    assert floored(estimate) == pytest.approx([2.5, 1.5, 5.0])
 
 
 def test_every_reason_has_its_own_number_and_a_plain_sentence():

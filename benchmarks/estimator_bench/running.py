@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from estimator_bench.telemetry import BOOT_S, UNIX_AT_BOOT_NS, Flight
-from magmav.core.channel import Channel, Circumstances
+from magmav.core.channel import Circumstances
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.field import ExpectedField
 from magmav.core.types import Estimate, Sample, State
 from magmav.geomag import world_magnetic_model
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings, with_value
-from magmav.vehicle import limits
+from magmav.vehicle import new_channel
 
 TICK_S = 1.0
 
@@ -99,7 +99,7 @@ def run(
         made.append(_Billed((make or ESTIMATORS[name])()))
         return made[-1]
 
-    channel = Channel(billed, limits(settings), settings.gate.steady_s)
+    channel = new_channel(settings, name, billed)
     ticks: list[Tick] = []
     due = TICK_S
     early_s, early_n = 0.0, 1

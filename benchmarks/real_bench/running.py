@@ -13,11 +13,11 @@ import numpy as np
 
 from magmav.core import gate
 from magmav.core.causes import Causes
-from magmav.core.channel import SIGMA_FLOOR_MG, Channel
+from magmav.core.channel import Channel
 from magmav.core.correction import iron_of_offsets
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.types import ZERO3, AxisState, CurrentReading, Estimate, State, ThrottleReading, Vec3
-from magmav.vehicle import limits
+from magmav.vehicle import new_channel
 from real_bench.tapes import Heard, Tape
 
 Make = Callable[[], Estimator]
@@ -44,8 +44,7 @@ class Moment:
 
 def run(tape: Tape, make: Make | str) -> dict[int, list[Moment]]:
     """By compass, what an estimator believed over time. make : a name in ESTIMATORS, or something that makes one."""
-    made = ESTIMATORS[make] if isinstance(make, str) else make
-    lines, steady_s = limits(tape.settings), tape.settings.gate.steady_s
+    name, made = (make, ESTIMATORS[make]) if isinstance(make, str) else ("adaptive", make)
     channels: dict[int, Channel] = {}
     stretches: dict[int, tuple[int, int]] = {}
     flown: dict[int, float] = {}
@@ -62,7 +61,7 @@ def run(tape: Tape, make: Make | str) -> dict[int, list[Moment]]:
         s, c, compass = event.sample, event.circumstances, event.sample.compass
         channel = channels.get(compass)
         if channel is None:
-            channel = channels[compass] = Channel(made, lines, steady_s)
+            channel = channels[compass] = new_channel(tape.settings, name, made)
         elif stretches[compass] != event.stretch:
             channel.restart()
             causes.restart(compass)
@@ -106,7 +105,7 @@ def offsets_to_store(tape: Tape, compass: int, e: Estimate) -> Vec3:
     """What a replay frozen at this estimate calls the compass's offsets at its end, (3,) mG, to be added."""
     end = next(h for h in reversed(tape.events) if isinstance(h, Heard) and h.sample.compass == compass)
     offsets = -iron_of_offsets(end.sample, e, end.circumstances.expected)
-    sigma = gate.floored(e, SIGMA_FLOOR_MG)
+    sigma = gate.floored(e)
     axes = gate.axis_states(e.own_sigma_mg, sigma, limits(tape.settings).axis_sigma_mg)
     stored = tape.boot.calibrations.offsets(compass)
     unknown = [axis is AxisState.NOT_OBSERVED for axis in axes]

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
-
 from magmav.core.motion import Motion
 from magmav.core.types import AttitudeReading, InertialReading, MagReading, Sample, Shaping, Vec3
 
@@ -172,7 +170,7 @@ class Assembler:
         if reading.boot_ns > known.heard_ns:
             known.pace(reading.boot_ns, fresh=False)
         known.heard_ns = reading.boot_ns
-        if known.sent_b_mg is not None and np.array_equal(reading.field_b_mg, known.sent_b_mg):
+        if known.sent_b_mg is not None and reading.field_b_mg.tolist() == known.sent_b_mg.tolist():
             self.counts["mag: repeated value"] += 1
             return None
         if known.sent_b_mg is not None:

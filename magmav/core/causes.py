@@ -153,8 +153,8 @@ class Causes:
 
     def _strange(self, w: _Watched, s: Sample, used_b_mg: Vec3) -> None:
         """Both as the autopilot uses it and, once the iron is known, without it."""
-        strength = math.hypot(*used_b_mg)
-        known = w.fitted is not None and _earthlike(math.hypot(*(field_of_sample(s) - w.fitted.iron_b_mg)))
+        strength = math.hypot(*used_b_mg.tolist())
+        known = w.fitted is not None and _earthlike(math.dist(field_of_sample(s).tolist(), w.fitted.iron_b_mg.tolist()))
         w.strange = 0 if known or _earthlike(strength) else w.strange + 1
         if w.strange >= _STRANGE_SAMPLES:
             text = f"field of {strength:.0f} mG, the Earth's is 150 to 950 mG: magnet or steel near compass"

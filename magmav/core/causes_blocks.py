@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from magmav.core.rotation import level_from_body
-from magmav.core.types import Sample
+from magmav.core.types import NO_SHAPING, Sample
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
 DOWN, FIRST, SECOND = slice(0, 3), slice(3, 6), slice(6, 9)
 TOP = 15  # features that the matrix D stands before, three axes each
@@ -62,8 +62,16 @@ class Block:
 
 def field_of_sample(s: Sample) -> Array:
     """z = A m + e, (3,) mG: the field as the autopilot shapes it, its offsets not applied."""
+    if s.shaping is NO_SHAPING:
+        return s.mag_b_mg
     out: Array = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
     return out
+
+
+def _turned(v: Vector, rate_rads: list[float], dt_s: float) -> Vector:
+    """v + rate dt x v."""
+    (x, y, z), (p, q, r) = v, rate_rads
+    return x + dt_s * (q * z - r * y), y + dt_s * (r * x - p * z), z + dt_s * (p * y - q * x)
 
 
 class Blocks:
@@ -80,7 +88,7 @@ class Blocks:
         self._filled = 0
         self._yaw_rad = 0.0
         self._chained = False
-        self._was: Array | None = None
+        self._was: Vector | None = None
         self._jumps = 0
         self._dt_s = 0.0
 
@@ -96,7 +104,8 @@ class Blocks:
             return
         if self._now is not None and self._standing_now is not grounded:
             self._close()
-        z = field_of_sample(s)
+        x, y, w = field_of_sample(s).tolist()
+        z = (x, y, w)
         if self._jumped(z, s):
             return
         boot_s = s.boot_ns / 1e9
@@ -109,13 +118,13 @@ class Blocks:
             self._chained = True
         self._row(self._now, s, z, delay_s, power, boot_s)
 
-    def _jumped(self, z: Array, s: Sample) -> bool:
+    def _jumped(self, z: Vector, s: Sample) -> bool:
         """A lone outlier: far from the value before, and not followed by others like it."""
         was, dt = self._was, self._dt_s
         far = (
             was is not None
             and dt < 0.5
-            and math.dist(z, was) > _JUMP_MG + _JUMP_SHARE * math.hypot(*z) * (math.hypot(*s.rate_b_rads) * dt)
+            and math.dist(z, was) > _JUMP_MG + _JUMP_SHARE * math.hypot(*z) * (math.hypot(*s.rate_b_rads.tolist()) * dt)
         )
         if far and self._jumps < _MOST_JUMPS:
             self._jumps += 1
@@ -124,20 +133,18 @@ class Blocks:
         return False
 
     def _row(
-        self, block: Block, s: Sample, z: Array, delay_s: float, power: tuple[float, float], boot_s: float
+        self, block: Block, s: Sample, z: Vector, delay_s: float, power: tuple[float, float], boot_s: float
     ) -> None:
-        level = level_from_body(s.roll_rad, s.pitch_rad)
+        cr, sr, cp, sp = math.cos(s.roll_rad), math.sin(s.roll_rad), math.cos(s.pitch_rad), math.sin(s.pitch_rad)
         c, si = math.cos(self._yaw_rad), math.sin(self._yaw_rad)
-        first, second, down = level[0] * c - level[1] * si, level[0] * si + level[1] * c, level[2]
-        row = self._rows[self._filled]
-        row[DOWN], row[FIRST], row[SECOND] = down, first, second
+        down = (-sp, cp * sr, cp * cr)
+        first = (cp * c, sp * sr * c - cr * si, sp * cr * c + sr * si)
+        second = (cp * si, sp * sr * si + cr * c, sp * cr * si - sr * c)
         if delay_s:  # the body turned on by w d since: a fixed direction was seen turned the other way
-            wx, wy, wz = (s.rate_b_rads * delay_s).tolist()
-            turned = np.array(((0.0, -wz, wy), (wz, 0.0, -wx), (-wy, wx, 0.0)))
-            row[:9] += (turned @ row[:9].reshape(3, 3).T).T.ravel()
-        row[9:15] = (boot_s - block.middle_s) * row[3:9]
-        row[ONE], row[AMPERE], row[THROTTLE] = 1.0, power[0], power[1]
-        row[FEATURES:] = z
+            turn = s.rate_b_rads.tolist()
+            down, first, second = (_turned(v, turn, delay_s) for v in (down, first, second))
+        level, t = (*first, *second), boot_s - block.middle_s
+        self._rows[self._filled] = (*down, *level, *(t * v for v in level), 1.0, *power, *z)
         self._filled += 1
         if self._filled == _BATCH:
             self._flush()

@@ -19,13 +19,12 @@ from magmav.core.correction import (
     stored_heading,
     turned_on,
 )
-from magmav.core.estimators import Estimator
+from magmav.core.estimators import Estimator, disagreement
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
 from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
-SIGMA_FLOOR_MG = (1.5, 1.5, 5.5)  # a real flight (thor75) missed its batch fit by 12 to 19 mG in z
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
 _GUESS_RAD = math.radians(45.0)  # a heading less sure than this is not published
@@ -43,6 +42,7 @@ class Circumstances:
     parameters_changed: bool
     grounded: bool
     frozen_s: float
+    stored_b_mg: Vec3 | None = None  # the offsets the autopilot holds, to be added
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +78,15 @@ _NO_ESTIMATE = Estimate(ZERO3, np.diag([1e6] * 3), vec3([1e3] * 3, "sigma"), 0.0
 class Channel:
     """Learns one compass. ``hold`` keeps the answer as it is while samples go on being judged by it."""
 
-    def __init__(self, make: Callable[[], Estimator], limits: gate.Limits, steady_s: float) -> None:
+    def __init__(
+        self,
+        make: Callable[[], Estimator],
+        limits: gate.Limits,
+        steady_s: float,
+        second: Callable[[], Estimator] | None = None,
+    ) -> None:
         self._make = make
+        self._make_second = second
         self.limits = limits
         self._steady_s = steady_s
         self.held = False
@@ -99,6 +106,9 @@ class Channel:
         """Begin again: what was learnt belongs to another stretch of data."""
         self.verdict = gate.NOTHING
         self._estimator = self._make()
+        self._second = None if self._make_second is None else self._make_second()
+        self._apart = 0.0  # sigmas between the two opinions
+        self._tilt2 = 0.0  # mean square of sin(tilt) where it was learnt
         self._excitation = Excitation()
         self._estimate: Estimate | None = None
         self._past: deque[tuple[int, Vec3]] = deque()
@@ -139,7 +149,10 @@ class Channel:
         if self.held:
             self._resume = True
         else:
-            self._estimator.step(self._after_hold(s))
+            s = self._after_hold(s)
+            self._estimator.step(s)
+            if self._second is not None:
+                self._second.step(s)
         belief = self._belief
         if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
             belief = self._believe(s, c)
@@ -152,7 +165,7 @@ class Channel:
         e = self.estimate
         if s.learn and self._estimate is not None:
             self._follow(s, e, c.expected)
-        sigma = gate.floored(e, SIGMA_FLOOR_MG)
+        sigma = gate.floored(e)
         horizontal, down = field_of(e, c.expected)
         covariance = covariance_of_field(s, e)
         tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
@@ -181,6 +194,10 @@ class Channel:
         field_mg = float(np.linalg.norm(corrected))
         weight = _FIELD_WEIGHT if self._field_mg else 1.0
         self._field_mg += weight * (field_mg - self._field_mg)
+        upright = math.cos(s.roll_rad) * math.cos(s.pitch_rad)
+        self._tilt2 += weight * (1.0 - upright * upright - self._tilt2)
+        second = None if self._second is None else self._second.estimate(expected)
+        self._apart = 0.0 if second is None else disagreement(e, second)
         level_mg = math.hypot(*level_field(corrected, s.roll_rad, s.pitch_rad))
         self._level_mg += weight * (level_mg - self._level_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
@@ -196,6 +213,13 @@ class Channel:
         written = [state is not AxisState.NOT_OBSERVED for state in states]
         return bool((moved <= 2.0 * sigma_mg + 3.0)[[True, True, written[2]]].all())
 
+    def _left(self, e: Estimate | None, c: Circumstances, sigma_mg: Vec3) -> float:
+        """What the tilt would make, level, of a down axis that stays as it is stored, mG; 0 where it is written."""
+        if e is None or c.stored_b_mg is None or sigma_mg[2] <= self.limits.axis_sigma_mg:
+            return 0.0
+        off = max(abs(float(c.stored_b_mg[2] + e.hard_iron_b_mg[2])) - float(sigma_mg[2]), 0.0)
+        return math.sqrt(max(self._tilt2, 0.0)) * off
+
     def _judge(self, s: Sample, c: Circumstances, sigma_mg: Vec3, offsets_sd: float) -> None:
         e = self._estimate
         steady = self.held or (self.verdict.state is State.READY and not s.learn)
@@ -206,6 +230,8 @@ class Channel:
             offsets_heading_sigma_rad=offsets_sd,
             field_mg=self._field_mg,
             level_mg=self._level_mg,
+            apart=self._apart,
+            left_mg=self._left(e, c, sigma_mg),
             steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
             sectors=self._excitation.sectors,
             frozen_s=c.frozen_s,

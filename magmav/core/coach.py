@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.core import gate
-from magmav.core.channel import SIGMA_FLOOR_MG
 from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Reason, State, Verdict
 
@@ -126,7 +125,7 @@ def advise(
     kind : MAV_TYPE, None where it is not known. limit_mg : the gate's line; an axis under it needs nothing. The advice
     is relative, so heading_rad (None where unknown) changes nothing: turning is worth the same from any heading.
     """
-    before = np.asarray(gate.floored(e, SIGMA_FLOOR_MG))
+    before = np.asarray(gate.floored(e))
     wanted = [i for i in range(3) if before[i] > limit_mg and e.says_b[i]]
     if not wanted:
         return ""

@@ -14,10 +14,11 @@ from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
 from magmav.core.heading import UNKNOWN, heading
 from magmav.core.rotation import euler_rates, wrap_tau
 from magmav.core.two_axis import Doubts, down_from_dip, heading_of_two_axes, vertical_component
-from magmav.core.types import IDENTITY3, Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
+from magmav.core.types import IDENTITY3, NO_SHAPING, Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
 
 _LEAST_LEVEL = 0.05  # of what two axes see of the level plane; 1 when both lie in it
 _WEAKEST_MG = 20.0  # a circle smaller than this is none
+_UNKNOWN_MG2 = mat3(1e6 * np.eye(3), "covariance")
 
 
 def corrected_field(s: Sample, e: Estimate, expected: ExpectedField | None) -> Vec3:
@@ -25,7 +26,9 @@ def corrected_field(s: Sample, e: Estimate, expected: ExpectedField | None) -> V
 
     Where that cannot be (no position, or beyond 60 degrees of tilt) it is 0.
     """
-    field: Vec3 = s.shaping.matrix @ (s.mag_b_mg - e.hard_iron_b_mg) + s.shaping.motor_b_mg
+    field: Vec3 = s.mag_b_mg - e.hard_iron_b_mg
+    if s.shaping is not NO_SHAPING:
+        field = s.shaping.matrix @ field + s.shaping.motor_b_mg
     if s.throttle is not None:
         field = field - (s.throttle - e.throttle_mean) * e.throttle_b_mg
     field = e.soft_iron_b @ field
@@ -47,11 +50,13 @@ def iron_of_offsets(s: Sample, e: Estimate, expected: ExpectedField | None) -> V
     Held level, soft iron bends the downward field into a constant that looks like hard iron; the rest turns with the
     heading and no offset can take it (estimation.md section 5). Without soft iron it is the hard iron itself.
     """
-    if np.array_equal(e.soft_iron_b, IDENTITY3):
+    if e.soft_iron_b is IDENTITY3:
         return e.hard_iron_b_mg
-    bent = np.linalg.inv(e.soft_iron_b)[:, 2] * field_of(e, expected)[1]
-    bent[2] -= field_of(e, expected)[1]
-    return vec3(e.hard_iron_b_mg + np.linalg.solve(s.shaping.matrix, bent), "hard iron")
+    down_b = np.array((0.0, 0.0, field_of(e, expected)[1]))
+    bent = np.linalg.solve(e.soft_iron_b, down_b) - down_b
+    if s.shaping.matrix is not IDENTITY3:
+        bent = np.linalg.solve(s.shaping.matrix, bent)
+    return vec3(e.hard_iron_b_mg + bent, "hard iron")
 
 
 def with_third(field_b_mg: Vec3, s: Sample, radius_mg: float, expected: ExpectedField | None) -> Vec3:
@@ -114,15 +119,15 @@ def published(
 def turned_on(s: Sample, delay_s: float, h: Heading) -> Heading:
     """The heading of the measurement, turned on to the time of the message by the gyro."""
     lead = s.lead_rad + delay_s * euler_rates(s.roll_rad, s.pitch_rad, s.rate_b_rads)[2]
-    return replace(h, magnetic_rad=wrap_tau(h.magnetic_rad + lead), true_rad=wrap_tau(h.true_rad + lead))
+    magnetic, true = wrap_tau(h.magnetic_rad + lead), wrap_tau(h.true_rad + lead)
+    return Heading(h.valid, h.true_valid, magnetic, true, h.sigma_rad)
 
 
 def stored_heading(s: Sample, sent_b_mg: Vec3, expected: ExpectedField | None) -> Heading:
     """The heading of the stream as the autopilot corrects it. Its sigma is not known: pi."""
-    covariance = np.eye(3) * 1e6
     radius = 0.0 if expected is None else expected.horizontal_mg
-    h = published(s, sent_b_mg, radius, covariance, math.pi, 0.0, expected)
-    return replace(h, sigma_rad=math.pi) if h.valid else h
+    h = published(s, sent_b_mg, radius, _UNKNOWN_MG2, math.pi, 0.0, expected)
+    return h if s.axes == 3 or not h.valid else replace(h, sigma_rad=math.pi)
 
 
 def without_third(undo: Callable[[Vec3], Vec3], shaping: Shaping) -> tuple[Callable[[Vec3], Vec3], Shaping]:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from magmav.core.types import Vec3
 
 _BANDS = (1, 6, 10, 6, 1)  # cells per band from nose-up pole to tail pole: about equal areas
@@ -26,11 +24,11 @@ class Excitation:
 
     def see(self, field_b_mg: Vec3, heading_rad: float | None) -> None:
         """Take a corrected field and its heading."""
-        length = float(np.linalg.norm(field_b_mg))
+        x, y, z = field_b_mg.tolist()
+        length = math.hypot(x, y, z)
         if length <= 0.0:
             return
-        x, y, z = field_b_mg / length
-        band = sum(z > edge for edge in _EDGES)
+        band = sum(z / length > edge for edge in _EDGES)
         around = int((math.atan2(y, x) / math.tau % 1.0) * _BANDS[band])
         self._cells.add((band, min(around, _BANDS[band] - 1)))
         if heading_rad is not None:

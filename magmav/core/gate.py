@@ -21,6 +21,8 @@ _EARTH_LEVEL_MG = (_WEAK_HORIZONTAL_MG / 2.0, 450.0)  # horizontally, all that t
 _FROZEN_S = 3.0
 _SLACK = 1.25  # a verdict once reached is kept until a line is crossed by this much: no flicker
 _HEADING_SECTORS = 3
+_APART = 4.0
+_STRANGE_NIS = 5.0  # over the last second: something is going on that no estimate has caught up with
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,8 @@ class Evidence:
     assumed: bool
     parameters_changed: bool
     grounded: bool  # a flying vehicle that has not flown yet, and nobody said that the bench will do
+    apart: float = 0.0  # sigmas between the estimate and the second opinion
+    left_mg: float = 0.0  # level field that a down axis not written leaves wrong, at the tilt flown
     axes: int = 3  # 2: the third component of the field comes from the dip, or is missing without a position
 
 
@@ -131,13 +135,21 @@ def _missing(
     out += [n for n, axis in zip(names, axes, strict=False) if axis is AxisState.NOT_OBSERVED]
     if e.offsets_heading_sigma_rad > limits.heading_sigma_rad * slack or e.sectors < _HEADING_SECTORS:
         out.append(Reason.HEADING_UNSURE)
-    if estimate.changed_ago_s < limits.change_s:
+    if e.left_mg > limits.heading_sigma_rad * slack * _horizontal(e, estimate):
+        out.append(Reason.Z_NOT_OBSERVED)
+    if e.apart > _APART * slack:
+        out.append(Reason.OPINIONS_DIFFER)
+    if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS:
         out.append(Reason.JUST_CHANGED)
     if not e.steady:
         out.append(Reason.STILL_MOVING)
     if e.relative:
         out.append(Reason.RELATIVE_ONLY)
     return tuple(out)
+
+
+def _horizontal(e: Evidence, estimate: Estimate) -> float:
+    return estimate.horizontal_mg if e.expected is None else e.expected.horizontal_mg
 
 
 def _notes(e: Evidence) -> tuple[Reason, ...]:
@@ -156,9 +168,9 @@ def _notes(e: Evidence) -> tuple[Reason, ...]:
     return tuple(out)
 
 
-def floored(estimate: Estimate, floor_mg: tuple[float, float, float]) -> Vec3:
+def floored(estimate: Estimate) -> Vec3:
     """Claimed sigma per axis, mG: never under what no field test has ever shown (estimation.md, upload rule)."""
     own = np.sqrt(np.maximum(np.diag(estimate.covariance_mg2), 0.0))
-    out = np.array([math.hypot(float(s), f) for s, f in zip(own, floor_mg, strict=True)])
+    out = np.array([math.hypot(float(s), f) for s, f in zip(own, estimate.floor_mg, strict=True)])
     out.flags.writeable = False
     return out

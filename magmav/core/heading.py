@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magmav.core.rotation import level_from_body, wrap_tau
+from magmav.core.rotation import wrap_tau
 from magmav.core.types import Heading, Mat3, Vec3
 
 UNKNOWN = Heading(False, False, 0.0, 0.0, 0.0)
@@ -46,8 +46,11 @@ def heading_sigma(
     An offset error e turns the heading by (its level, crosswise part) / H, so the mean over all headings is the
     RMS of both level axes; a tilt error turns it by tan(dip) = V / H per radian (seed-methods.md S1).
     """
-    level = level_from_body(roll_rad, pitch_rad)[:2]
-    spread = float(np.trace(level @ covariance_b_mg2 @ level.T)) / 2.0
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = covariance_b_mg2.tolist()
+    cp = math.cos(pitch_rad)
+    x, y, z = -math.sin(pitch_rad), cp * math.sin(roll_rad), cp * math.cos(roll_rad)  # down; level is all but that
+    down = x * (x * xx + y * (xy + yx) + z * (xz + zx)) + y * (y * yy + z * (yz + zy)) + z * z * zz
+    spread = (xx + yy + zz - down) / 2.0
     return min(math.pi, math.hypot(math.sqrt(max(spread, 0.0)), down_mg * tilt_sigma) / max(horizontal_mg, 1.0))
 
 

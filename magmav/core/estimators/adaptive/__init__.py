@@ -30,6 +30,8 @@ from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
+_FLOOR_MG = (0.5, 0.5, 1.0)  # lower than others': how much structure the readings have shows in its noise
+_STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 
 
 class AdaptiveEstimator:
@@ -142,7 +144,7 @@ class AdaptiveEstimator:
         own = np.einsum("kiaib->kiab", apart)
         own += smear(u, block.rate_b_rads, n.sync_s)[..., :k, :k]
         np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
-        doubted(own, nu, n.doubt_nis)
+        strange = doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)
         log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(1)
         flat = nu.reshape(count, size * k)
@@ -164,7 +166,7 @@ class AdaptiveEstimator:
             if self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s):
                 self._change.open(bank)
                 self._residual_n = 0
-        self._nis += min(block.dt_s / 2.0, 0.5) * (min(float(nis[best]), 40.0 * size) / (k * size) - self._nis)
+        self._nis += min(block.dt_s, 0.5) * (float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis)
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
@@ -198,6 +200,7 @@ class AdaptiveEstimator:
             says_b=(True, True, self._axes == 3),
             throttle_b_mg=vec3(mean[at.K], "throttle"),
             throttle_mean=self._drive + 0.5,
+            floor_mg=_FLOOR_MG,
         )
 
 

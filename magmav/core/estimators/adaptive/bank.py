@@ -62,11 +62,11 @@ class Bank:
         diagonal[:, at.K] = n.throttle_mg**2
         for m, one in enumerate(MODELS):
             rows = model == m
+            diagonal[rows, at.R] = one.mounting_rad**2
             diagonal[rows, at.S] = np.repeat((one.soft_diagonal**2, one.soft_cross**2), 3)
         diagonal[:, at.G] = n.gyro_rads**2
         diagonal[:, at.T] = n.delay_s**2
         diagonal[:, at.KAPPA] = n.kappa**2
-        diagonal[:, at.R] = n.mounting_rad**2
         log_weight = np.log([MODELS[m].weight / n.yaws for m in model])
         return Bank(x, p, model, log_weight, n)
 

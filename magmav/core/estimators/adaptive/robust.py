@@ -37,14 +37,16 @@ class WildGate:
         return bool(off > _WILD_MG + _WILD_MG_PER_RAD * sum(self._turns))
 
 
-def doubted(expected: Array, nu: Array, doubt_nis: float) -> None:
+def doubted(expected: Array, nu: Array, doubt_nis: float) -> Array:
     """Make what is expected of a strange reading as wide as it is strange, in place (Huber's weights).
 
     expected (K, n, 3, 3) : each reading's own part of the innovation's covariance.  nu (K, n, 3).
+    Their normalised squares before that, (K, n).
     """
-    nis = (nu * np.linalg.solve(expected, nu[..., None])[..., 0]).sum(2)
+    nis: Array = (nu * np.linalg.solve(expected, nu[..., None])[..., 0]).sum(2)
     if nis.max() > doubt_nis:
         expected *= np.maximum(nis / doubt_nis, 1.0)[..., None, None]
+    return nis
 
 
 def adapt(bank: Bank, nu: Array, mean_white: Array, mean_share: Array, dt_s: float, n: Tuning) -> None:

@@ -14,11 +14,12 @@ class Model:
     iron_walk_mg: float  # per square root of a second
     soft_diagonal: float
     soft_cross: float
+    mounting_rad: float  # how crooked it may sit
 
 
-HARD = Model(0.70, 0.05, 0.01, 0.007)
-SOFT = Model(0.27, 0.05, 0.04, 0.028)
-DRIFT = Model(0.03, 0.7, 0.01, 0.007)
+HARD = Model(0.70, 0.05, 0.005, 0.0035, math.radians(0.3))
+SOFT = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.5))
+DRIFT = Model(0.03, 0.7, 0.005, 0.0035, math.radians(0.3))
 MODELS = (HARD, SOFT, DRIFT)
 
 
@@ -29,7 +30,7 @@ class Tuning:
     yaws: int = 12
     prior_iron_mg: float = 300.0
     ground_mg: float = 100.0  # what was learnt by hand may be off by so much in flight
-    model_mg: float = 5.0  # of the world model, per component
+    model_mg: float = 4.0  # of the world model, per component
     blind_h_mg: tuple[float, float] = (230.0, 80.0)  # without a position: mean and sigma
     blind_v_mg: float = 200.0
     block_s: float = 0.2  # readings taken in together span at most this
@@ -56,7 +57,6 @@ class Tuning:
     gyro_rads: float = math.radians(0.6)
     delay_s: float = 0.03
     kappa: float = 0.03
-    mounting_rad: float = math.radians(0.4)
     gain: float = 0.005  # of the sensor as a whole: the field it shows is the model's but for this share
     turn_walk_rad: float = math.radians(0.2)  # per square root of a second
     turn_scale: float = 0.01
