@@ -71,8 +71,8 @@ class CompassLog:
         self.learnt += record.learnt
         self.boot_s.append(record.boot_ns / 1e9)
         self.age_s.append(record.age_s)
-        self.sensor_b_mg.extend(sensor)
-        self.offsets_b_mg.extend(record.offsets_mg)
+        self.sensor_b_mg.extend(sensor.tolist())
+        self.offsets_b_mg.extend(record.offsets_mg.tolist())
         self.magnetic_rad.append(magnetic)
         self.true_rad.append(true)
         self.stored_magnetic_rad.append(stored_magnetic)

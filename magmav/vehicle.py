@@ -197,7 +197,7 @@ class Vehicle:
         if sample is None:
             return self._frozen(r, t_ns, channel)
         sample = self._handed_over(self._handled(sample, channel.held), channel.estimate)
-        circumstances = self._circumstances(compass, unix_ns)
+        circumstances = self._circumstances(compass, here)
         if self._tap is not None:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
@@ -344,10 +344,10 @@ class Vehicle:
     def _unflown(self) -> bool:
         return self.phase.flyer and self.phase.takeoff_ns is None
 
-    def _circumstances(self, compass: int, unix_ns: int) -> Circumstances:
+    def _circumstances(self, compass: int, here: ExpectedField | None) -> Circumstances:
         held = self.calibrations
         return Circumstances(
-            expected=self.expected(unix_ns),
+            expected=here,
             relative=not held.known(compass),
             assumed=held.assumed(compass),
             parameters_changed=held.changed(compass),

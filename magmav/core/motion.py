@@ -15,7 +15,6 @@ import numpy as np
 from magmav.core.marg_attitude import Carried, MargAttitude
 from magmav.core.own_frame import Frame, Vector, carried, levelled, matrix, of_attitude, stepped
 from magmav.core.rotation import (
-    body_from_earth,
     cross_matrix,
     euler_rates,
     level_from_body,
@@ -45,7 +44,12 @@ class MotionState(NamedTuple):
     source: str
     epoch: int
     bridged: bool  # the yaw step over a long gap is still good
-    body_from_own: Mat3  # from a frame level with the earth that the gyro carries along; good at every attitude
+    own_frame: Frame  # level with the earth, carried along by the gyro; good at every attitude
+
+    @property
+    def body_from_own(self) -> Mat3:
+        """The same as a matrix."""
+        return matrix(self.own_frame)
 
 
 class _Heard(NamedTuple):
@@ -146,12 +150,12 @@ class Motion:
                 heard = earlier
             a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
             roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, heard.yaw_rad + dy * age
-            frame = matrix(carried(heard.own_frame, heard.rate_b_rads, age))
+            frame = carried(heard.own_frame, heard.rate_b_rads, age)
             return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame)
         own = self._own.at(boot_ns)
         if own is None:
             return None
-        frame = body_from_earth(own.roll_rad, own.pitch_rad, own.yaw_rad)
+        frame = of_attitude(own.roll_rad, own.pitch_rad, own.yaw_rad)
         return MotionState(own.roll_rad, own.pitch_rad, own.yaw_rad, own.rate_b_rads, "OWN", own.epoch, False, frame)
 
 
