@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,7 @@ class TwostepEstimator:
         self._spread: Array = np.zeros((3, 3))  # of other answers that fit nearly as well
         self._model_mg: float | None = None
         self._axes = 3
+        self._said: tuple[float, Estimate] | None = None  # for which length, since the last block
         self._down: Array = np.zeros((3, 4))  # mean of down (x) (y, 1)
 
     # ------------------------------------------------------------ learning
@@ -81,6 +83,7 @@ class TwostepEstimator:
         self._samples += 1
         closed = self._blocks.add(*passed)
         if closed is not None:
+            self._said = None
             self._learn(closed)
             self._look_down(s, np.array((x, y, z, UNIT_MG)) / UNIT_MG)
 
@@ -94,7 +97,7 @@ class TwostepEstimator:
             self._x = np.concatenate((turn @ self._x[C], self._x[3:4], np.zeros(6)))
             self._priors = replace(self._priors, centre=self._x[C].copy(), info=np.linalg.inv(turn @ moved @ turn.T))
         self._matrix = mat3(matrix, "matrix")
-        self._stretch, self._seen, self._spread = None, 0, np.zeros((3, 3))
+        self._stretch, self._said, self._seen, self._spread = None, None, 0, np.zeros((3, 3))
         self._sieve, self._blocks = Sieve(), Blocks()
 
     def _length(self, model_mg: float | None) -> tuple[float, float]:
@@ -219,8 +222,18 @@ class TwostepEstimator:
             return None
         if len(self._blocks.sums) < _LEAST_BLOCKS:
             return None
-        P, priors = self._covariance, self._priors
         length, sigma = self._length(self._model_mg if expected is None else expected.total_mg)
+        if self._said is None or self._said[0] != length:
+            self._said = length, self._answer(x, got, length, sigma)
+        ago_s = min(self._now_s - self._changed_s, _FOREVER_S)
+        return replace(self._said[1], samples=self._samples, changed_ago_s=ago_s)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What was said since the last block is made again when asked."""
+        return self.__dict__ | {"_said": None}
+
+    def _answer(self, x: Array, got: Stretch, length: float, sigma: float) -> Estimate:
+        P, priors = self._covariance, self._priors
         if abs(length - priors.length) > _SAME_MG / UNIT_MG:
             priors = replace(priors, length=length, length_sigma=sigma)
             x, P = solved(x, got, priors, self._noise.white2, 4)
@@ -245,7 +258,7 @@ class TwostepEstimator:
             residual_mg=math.sqrt(left2) * UNIT_MG,
             step_nis=self._noise.nis,
             samples=self._samples,
-            changed_ago_s=min(self._now_s - self._changed_s, _FOREVER_S),
+            changed_ago_s=_FOREVER_S,
             soft_iron_b=mat3(soft, "soft iron"),
         )
 
