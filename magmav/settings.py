@@ -66,7 +66,7 @@ class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is learnt from, and how."""
 
     on: Annotated[bool, _knob("learn at all; off: what is known is kept and published", param="MMAG_LEARN")] = True
-    estimator: Annotated[str, _knob("one of " + ", ".join(ESTIMATORS), ge=None)] = "kalman"
+    estimator: Annotated[str, _knob("one of " + ", ".join(ESTIMATORS), ge=None)] = "adaptive"
     on_ground: Annotated[bool, _knob("--bench: what flies learns, and may be ready, on the ground too")] = False
     settle_s: Annotated[float, _knob("not learnt from after a change of compass parameters", "s", ge=0.2, le=10.0)] = (
         1.0

@@ -16,7 +16,7 @@ from magmav.core.estimators.adaptive import AdaptiveEstimator, without_prior
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.bank import Bank, field_covariance
 from magmav.core.estimators.adaptive.block import Gathering
-from magmav.core.estimators.adaptive.measurement import Equation, smear, soft_matrix
+from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import body_from_earth
@@ -68,9 +68,7 @@ def test_every_column_of_the_jacobian_is_the_derivative(seed):
     """At S = 0 and small tilt errors; the tilt, mounting, delay and kappa columns are exact in themselves."""
     x, block = states(seed), block_of(seed)
     x[:, at.E] = x[:, at.R] = x[:, at.T : at.T + 1] = x[:, at.KAPPA : at.KAPPA + 1] = 0.0
-    equation = Equation(len(x), len(block))
-    y, j, u = equation(x, block)
-    j, y = j.copy(), y.copy()
+    _, j, u = equation(x, block)
     assert np.linalg.norm(u, axis=2) == pytest.approx(np.tile(np.hypot(x[:, at.H], x[:, at.V]), (3, 1)).T)
     for i in range(at.SIZE):
         step = 1e-6 * max(1.0, float(np.abs(x[:, i]).max()))
@@ -84,7 +82,7 @@ def test_every_column_of_the_jacobian_is_the_derivative(seed):
 def test_the_equation_is_the_one_that_is_written():
     """Term by term, in plain matrices, for one hypothesis and one reading."""
     x, block = states(8, k=1), block_of(8, n=2)
-    (y, *_), (row,) = Equation(1, 2)(x, block)[0], x
+    (y, *_), (row,) = equation(x, block)[0], x
     for i in range(2):
         r = np.column_stack((block.north_b[i], block.east_b[i], block.down_b[i]))
         a = row[at.ALPHA] - row[at.G] @ block.ahead_s[i]
@@ -133,7 +131,7 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(reading
     mine._bank, mine._model_mg = bank, HERE
     theirs = ExtendedKalmanFilter(dim_x=at.SIZE, dim_z=3 * readings)
     theirs.x, theirs.P = bank.x[0].copy(), bank.p[0].copy()
-    copy_of, equation, gathering, yaw = copy.deepcopy(bank), Equation(1, readings), Gathering(), 0.0
+    copy_of, gathering, yaw = copy.deepcopy(bank), Gathering(), 0.0
     for i, s in enumerate(flight, 1):
         yaw += s.yaw_step_rad
         body = body_from_earth(s.roll_rad, s.pitch_rad, yaw)
@@ -180,7 +178,7 @@ def test_merging_hypotheses_keeps_all_belief():
     bank.x[:, at.ALPHA] = 0.3
     bank.log_weight = np.log(np.random.default_rng(1).uniform(0.1, 1.0, len(bank)))
     before = {m: bank.weights()[bank.model == m].sum() for m in range(len(MODELS))}
-    bank.tidy(n)
+    bank.tidy(n, 6)
     assert len(bank) == len(MODELS)
     assert dict(zip(bank.model.tolist(), bank.weights(), strict=True)) == pytest.approx(before)
 
@@ -193,7 +191,7 @@ def test_stopping_and_resuming_changes_no_bit(copied):
     a, b = one.estimate(EXPECTED), two.estimate(EXPECTED)
     assert np.array_equal(a.hard_iron_b_mg, b.hard_iron_b_mg)
     assert np.array_equal(a.covariance_mg2, b.covariance_mg2)
-    assert len(pickle.dumps(one)) < 100_000
+    assert len(pickle.dumps(one)) < 50_000
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

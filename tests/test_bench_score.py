@@ -151,8 +151,8 @@ def test_twostep_refuses_what_does_not_turn(points):
 
 def test_peers_that_live_here_need_nothing_else(flown):
     flight, heard = flown
-    got = peer_scores(flight, heard, Ready(("twostep", "twostep_win", "sar_kf")))
-    assert [s.name for s in got] == ["twostep", "twostep_win", "sar_kf"]
+    got = peer_scores(flight, heard, Ready(("twostep_batch", "twostep_win", "sar_kf")))
+    assert [s.name for s in got] == ["twostep_batch", "twostep_win", "sar_kf"]
     assert got[1].full_deg[1] < 3.0  # at 60 s; the flight ends at 70
     assert got[0].ready_seconds == 0 and got[0].ready_s == math.inf
 
@@ -190,7 +190,7 @@ def test_the_command_says_the_same_twice_and_refuses_by_name(tmp_path, capsys):
     assert estimators.main([*arguments.split(), "--json", str(file)]) == 0
     assert "TUNING" in capsys.readouterr().out
     first = json.loads(file.read_text())["runs"]
-    again = estimators.judged(estimators.Task("slow2", 7, ("taubin",), False, Ready(("twostep",)))).scored
+    again = estimators.judged(estimators.Task("slow2", 7, ("taubin",), False, Ready(("twostep_batch",)))).scored
     second = json.loads(json.dumps([as_dict(s) for s in again]))
     for one in (*first, *second):
         one["us_per_sample"] = one["us_first_20s"] = None

@@ -1,6 +1,6 @@
 """Methods of other people, written here from their published equations, correct: what the estimators must beat.
 
-    twostep      Alonso and Shuster 2002, TWOSTEP; hard iron from the field's length alone
+    twostep_batch  Alonso and Shuster 2002, TWOSTEP; hard iron from the field's length alone
     twostep_win  the same over the last 40 s, with the worst tenth of the values taken out, twice
     sar_ls, sar_kf, sar_aid    Troni and Whitcomb 2019, hard iron from x' = -w x (x - b)
 
@@ -192,7 +192,7 @@ def answers(name: str, c: Columns, t_s: float) -> Array | None:
     """Hard iron by a method's name from all values up to a time. ValueError for a name that does not exist."""
     so_far = c.between(-np.inf, t_s)
     match name:
-        case "twostep":
+        case "twostep_batch":
             return twostep(so_far.mag_mg, c.field_mg)
         case "twostep_win":
             return twostep_windowed(c.between(t_s - WINDOW_S, t_s).mag_mg, c.field_mg)
@@ -205,5 +205,5 @@ def answers(name: str, c: Columns, t_s: float) -> Array | None:
     raise ValueError(f"no peer called {name!r}")
 
 
-EVERY_SECOND = ("twostep", "twostep_win")  # cheap enough to be asked all along
+EVERY_SECOND = ("twostep_batch", "twostep_win")  # cheap enough to be asked all along
 AT_CHECKPOINTS = ("sar_ls", "sar_kf", "sar_aid")

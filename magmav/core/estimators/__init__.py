@@ -3,8 +3,8 @@
 An estimator takes Samples one at a time in O(1) and says on request what it believes. It must not know where Samples
 come from. It can be copied at any moment (copy.deepcopy, pickle) and the copy goes on to the same bits.
 
-kalman           a linear Kalman filter: levelled field constant but for the turning the gyro reports (the default)
-adaptive         a bank of filters over headings and models: also soft iron, drift, throttle (not the default yet)
+kalman           a linear Kalman filter: levelled field constant but for the turning the gyro reports
+adaptive         a bank of filters over headings and models: also soft iron, drift, throttle (the default)
 twostep          the field's length alone, windowed (Alonso and Shuster 2002): a second opinion without attitude
 minmax           Sawicki 2017, method I: middle of the extremes
 kasa, bullock    methods II and III: the same least-squares circle or sphere, by two sets of equations

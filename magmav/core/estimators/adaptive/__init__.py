@@ -21,16 +21,20 @@ from magmav.core.estimators.adaptive.bank import Bank, field_covariance
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import Equation, smear, soft_matrix
+from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.process import advance
-from magmav.core.estimators.adaptive.robust import WildGate, adapt, doubted
+from magmav.core.estimators.adaptive.robust import WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
-_FLOOR_MG = (0.5, 0.5, 1.0)  # lower than others': how much structure the readings have shows in its noise
+_FLOOR_MG = (
+    0.5,
+    0.5,
+    1.0,
+)  # lower than others': how much structure the readings have shows in its noise
 _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 
 
@@ -42,7 +46,6 @@ class AdaptiveEstimator:
         self._bank: Bank | None = None
         self._gathering = Gathering()
         self._wild = WildGate()
-        self._equation = Equation(0, 0)
         self._change = ChangeWatch(self.tuning)
         self._own_yaw_rad = 0.0
         self._lost = False
@@ -96,7 +99,9 @@ class AdaptiveEstimator:
         if len(gathering) == n.block_readings or gathering.span_s + dt > n.block_s:
             self._learn()
 
-    def _prior(self, s: Sample, z: Array, down_b: Array) -> tuple[float, float, float, float]:
+    def _prior(
+        self, s: Sample, z: Array, down_b: Array
+    ) -> tuple[float, float, float, float]:
         n = self.tuning
         self._model_mg = s.model_mg
         if s.model_mg is not None:
@@ -127,14 +132,12 @@ class AdaptiveEstimator:
         self._update(bank, block)
         self._blocks += 1
         if self._blocks % n.prune_every == 0 and len(bank) > len(MODELS):
-            bank.tidy(n)
+            bank.tidy(n, n.most if self._blocks * n.block_s > n.narrow_s else len(bank))
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
         self._axes, self._matrix = k, block.shaping.matrix
-        if self._equation.shape != (count, size):
-            self._equation = Equation(count, size)
-        y, j, u = self._equation(bank.x, block)
+        y, j, u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         pj = bank.p @ rows.transpose(0, 2, 1)
@@ -146,31 +149,43 @@ class AdaptiveEstimator:
         np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
         strange = doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)
-        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(1)
+        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(
+            1
+        )
         flat = nu.reshape(count, size * k)
         pull = (inverse @ flat[:, :, None])[:, :, 0]
         nis = (flat * pull).sum(1)
         gain = pj @ inverse
         bank.x += (pj @ pull[:, :, None])[:, :, 0]
         bank.p -= gain @ pj.transpose(0, 2, 1)
-        bank.p = 0.5 * (bank.p + bank.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
+        bank.p = 0.5 * (
+            bank.p + bank.p.transpose(0, 2, 1)
+        )  # rounding must not grow into asymmetry
         bank.weigh(-0.5 * (nis + log_det), block.dt_s, n)
         best = int(np.argmax(bank.log_weight))
-        mean = nu.mean(1)
+        mean = nu.sum(1) / size
         variance = np.einsum("kiaja->ka", apart) / size**2
-        white = np.clip(mean / np.sqrt(variance), -4.0, 4.0)
+        white = between(mean / np.sqrt(variance), -4.0, 4.0)
         if self._blocks > n.adapt_after:
             adapt(bank, nu, white, bank.common_mg2[:, None] / variance, block.dt_s, n)
             push = bank.x[best, at.D] / bank.disturbance_mg[best]
             like = float(bank.product[best] / max(bank.square[best], 0.1))
-            if self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s):
+            if self._change.step(
+                white[best], mean[best], like, float(push @ push), block.dt_s
+            ):
                 self._change.open(bank)
                 self._residual_n = 0
-        self._nis += min(block.dt_s, 0.5) * (float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis)
-        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
+        self._nis += min(block.dt_s, 0.5) * (
+            float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis
+        )
+        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(
+            size, k
+        ) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
-        self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
+        self._residual_mg2 += weight * (
+            float((left * left).sum()) / (k * size) - self._residual_mg2
+        )
 
     # ------------------------------------------------------------ answer
 

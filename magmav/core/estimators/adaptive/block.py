@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.rotation import cross_matrix
 from magmav.core.types import Sample, Shaping
 
 _EYE3 = np.eye(3)
@@ -73,7 +72,11 @@ class Gathering:
         if not self._samples:
             return True
         last = self._samples[-1]
-        return s.shaping is last.shaping and s.axes == last.axes and s.tilt_from == last.tilt_from
+        return (
+            s.shaping is last.shaping
+            and s.axes == last.axes
+            and s.tilt_from == last.tilt_from
+        )
 
     def passes(self, dt_s: float, down_b: Array, turn_rad2: float) -> None:
         """Time goes by."""
@@ -96,12 +99,11 @@ class Gathering:
         bodies = np.array(self._bodies)
         down_b = bodies[:, :, 2]
         rates = np.array([s.rate_b_rads for s in self._samples])
-        crosses = np.array(
-            [
-                np.vstack((cross_matrix(-down[1], down[0], 0.0), cross_matrix(*rate)))
-                for down, rate in zip(down_b.tolist(), rates.tolist(), strict=True)
-            ]
-        )
+        crosses = np.zeros((len(rates), 6, 3))
+        for first, (x, y, z) in ((0, (-down_b[:, 1], down_b[:, 0], 0.0)), (3, rates.T)):
+            crosses[:, first, 1], crosses[:, first, 2] = -z, y
+            crosses[:, first + 1, 0], crosses[:, first + 1, 2] = z, -x
+            crosses[:, first + 2, 0], crosses[:, first + 2, 1] = -y, x
         last = self._samples[-1]
         out = Block(
             z=np.array(self._z),

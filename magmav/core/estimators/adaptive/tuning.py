@@ -31,7 +31,10 @@ class Tuning:
     prior_iron_mg: float = 300.0
     ground_mg: float = 100.0  # what was learnt by hand may be off by so much in flight
     model_mg: float = 4.0  # of the world model, per component
-    blind_h_mg: tuple[float, float] = (230.0, 80.0)  # without a position: mean and sigma
+    blind_h_mg: tuple[float, float] = (
+        230.0,
+        80.0,
+    )  # without a position: mean and sigma
     blind_v_mg: float = 200.0
     block_s: float = 0.2  # readings taken in together span at most this
     block_readings: int = 6  # and are at most so many
@@ -47,7 +50,9 @@ class Tuning:
     sync_s: float = 0.02
     tilt_rad: float = math.radians(1.0)
     tilt_tau_s: float = 15.0
-    own_tilt_rad: float = math.radians(6.0)  # of gyro and accelerometer alone, misled by every acceleration
+    own_tilt_rad: float = math.radians(
+        6.0
+    )  # of gyro and accelerometer alone, misled by every acceleration
     own_tilt_tau_s: float = 6.0
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
@@ -65,6 +70,8 @@ class Tuning:
     forget_s: float = 60.0
     prune_every: int = 8
     prune_below: float = 1e-4
+    narrow_s: float = 20.0  # of learning; from then on
+    most: int = 6  # hypotheses are kept, and the best of each model
     merge_sigma: float = 0.35
     change_tau_s: float = 1.5
     change_chi2: float = 60.0
