@@ -81,6 +81,7 @@ def parser() -> argparse.ArgumentParser:
     replay.add_argument(
         "--learn-for", type=float, metavar="S", help="freeze S seconds after take-off and score the rest"
     )
+    replay.add_argument("--after-flight", action="store_true", help="the iron of every moment, with all of it known")
     replay.add_argument("--every", type=float, metavar="S", help="what was known every S seconds")
     replay.add_argument("--records", type=Path, metavar="FILE", help="every Record, .jsonl or .csv")
     replay.add_argument("--reference", type=Path, metavar="CSV", help="truth file instead of ATTITUDE yaw")

@@ -2,7 +2,7 @@
 
 The recording goes through the pipeline once; the Samples it leads to are kept and given to each method in turn, so all
 methods see the same values, the same tilt and the same moments that teach. Scores of one column are made on the
-same samples.
+same samples. Beside the adaptive estimator stands what it knows afterwards, run both ways (core.after_flight).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.core import gate
+from magmav.core.after_flight import after_flight
 from magmav.core.channel import Circumstances
 from magmav.core.correction import iron_at_throttle
 from magmav.core.dip import dip_from_model
@@ -34,6 +35,9 @@ from magmav.vehicle import Boot, Vehicle, new_channel
 
 Floats = NDArray[np.float64]
 Result = dict[str, Any]
+
+BOTH_WAYS = "adaptive_both"
+METHODS = [n for name in ESTIMATORS for n in ((name, BOTH_WAYS) if name == "adaptive" else (name,))]
 
 
 class Heard(NamedTuple):
@@ -132,17 +136,32 @@ class _Timed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What one method made of a tape: after the first half, at the end, its cost, and the gate's word on it."""
+    """What one method made of a tape: after the first half, at the end, its cost, and the gate's word on it.
+
+    state : None where it is known only afterwards, and no gate was asked.  path_b_mg : (N, 3) hard iron at each sample.
+    """
 
     name: str
     half: Estimate | None
     whole: Estimate | None
     us_per_sample: float
-    state: str
+    state: str | None
     reasons: tuple[str, ...]
     refusal: str | None
-    weak: str | None
-    has_sigma: bool
+    weak: str | None = None
+    has_sigma: bool = True
+    path_b_mg: Floats | None = None
+
+
+def try_both_ways(heard: Sequence[Heard], half: int, clock: Callable[[], float]) -> Outcome:
+    """The adaptive estimator run both ways over a tape, and over its first half alone."""
+    samples = [h.sample for h in heard]
+    first, begun = after_flight(samples[:half]), clock()
+    whole = after_flight(samples)
+    us, half_answer = 1e6 * (clock() - begun) / len(heard), None if first is None else first.answer
+    if whole is None:
+        return Outcome(BOTH_WAYS, half_answer, None, us, None, (), "too little data")
+    return Outcome(BOTH_WAYS, half_answer, whole.answer, us, None, (), None, path_b_mg=whole.iron_of(samples))
 
 
 def try_estimator(
@@ -192,16 +211,16 @@ def compare(
 ) -> Result:
     """The document that ``magmav compare --json`` prints.
 
-    clock : seconds, for the cost per sample.  only : names of ESTIMATORS; all when empty.
+    clock : seconds, for the cost per sample.  only : names of METHODS; all when empty.
     reference_csvs : truth, one file per boot of the vehicle.  reference_name : what to call it in the result.
     tapes : filled with the points each compass was fitted to, for pictures.
     Raises ValueError for an unknown name, NothingToLearnFrom when no compass was heard, TruthError for a bad
     reference file.
     """
-    names = list(only) or list(ESTIMATORS)
-    unknown = [n for n in names if n not in ESTIMATORS]
+    names = list(only) or METHODS
+    unknown = [n for n in names if n not in METHODS]
     if unknown:
-        raise ValueError(f"no estimator called {unknown[0]!r}; there are {', '.join(ESTIMATORS)}")
+        raise ValueError(f"no estimator called {unknown[0]!r}; there are {', '.join(METHODS)}")
     source = recording.name if source is None else source
     truths = [Reference.from_csv(path) for path in reference_csvs]
     if reference_name is not None:
@@ -238,7 +257,10 @@ def compare(
         half = first_half(columns)
         for name in names:
             progress(f"{source}: compass {compass}, {name}")
-            outcomes.append(try_estimator(name, tape.heard, half, *settings_of))
+            if name == BOTH_WAYS:
+                outcomes.append(try_both_ways(tape.heard, half, clock))
+            else:
+                outcomes.append(try_estimator(name, tape.heard, half, *settings_of))
         entry["compasses"].append(_compass(compass, tape, columns, half, outcomes, boot, reference))
     return {"source": source, "vehicles": list(vehicles.values())}
 
@@ -266,10 +288,10 @@ def _compass(
     split_s = float(columns.boot_s[min(half, len(columns.boot_s) - 1)])
     crash_ns = boot.phase.crash_ns
     crash_s = math.inf if crash_ns is None else crash_ns / 1e9
-    second, name = _score(
+    second, name = scored(
         columns, _calibrations(outcomes, "half", columns, matrix, stored), reference, Window(split_s, crash_s=crash_s)
     )
-    whole, _ = _score(
+    whole, _ = scored(
         columns, _calibrations(outcomes, "whole", columns, matrix, stored), reference, Window(crash_s=crash_s)
     )
     taught = columns.learn.nonzero()[0]
@@ -310,7 +332,7 @@ def _bare(columns: Columns) -> Calibration:
     return Calibration(down_mg=None if columns.expected is None else columns.down_mg(columns.expected.horizontal_mg))
 
 
-def _score(
+def scored(
     columns: Columns, calibrations: dict[str, Calibration], reference: Reference | None, window: Window
 ) -> tuple[dict[str, HeadingScore], str | None]:
     """Scores by name, and the reference's name; nothing where there is no reference."""

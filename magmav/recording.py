@@ -21,7 +21,7 @@ from magmav.pipeline import Pipeline
 from magmav.reference import Reference
 from magmav.service import Watcher, all_counts, hand_on
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Boot, Tap, Vehicle
 
 Result = dict[str, Any]
 
@@ -145,15 +145,16 @@ def replay(
     watchers: Sequence[Watcher] = (),
     references: dict[int, Reference] | None = None,
     stop: Callable[[], bool] = lambda: False,
+    tap: Tap | None = None,
 ) -> Result:
     """Run a recording to its end; the result is the JSON document that ``magmav replay --json`` prints.
 
-    references : filled with what each system was scored against, for pictures.
+    references : filled with what each system was scored against, for pictures.  tap : see vehicle.Tap.
     Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
     """
     truth = None if reference_csv is None else Reference.from_csv(reference_csv)
     source = recording.name if source is None else source
-    pipeline = Pipeline(settings, model, recording.unix_offset_ns)
+    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap)
     keeper = Keeper(pipeline, learn_for_s)
     play(recording, pipeline, (keeper, *watchers), stop)
     earlier = keeper.bring_back()

@@ -29,6 +29,8 @@ def replay(o: argparse.Namespace) -> int:
 
     if o.learn_for is not None and not o.learn_for > 0.0:
         raise SettingsError(f"--learn-for: want seconds above 0, got {o.learn_for:g}")
+    if o.after_flight and o.learn_for is not None:
+        raise SettingsError("--after-flight: takes all of the flight; leave out --learn-for")
     if o.every is not None and not o.every > 0.0:
         raise SettingsError(f"--every: want seconds above 0, got {o.every:g}")
     settings = settings_of(o)
@@ -49,6 +51,11 @@ def replay(o: argparse.Namespace) -> int:
             traces = TraceCollector()
             watchers.append(lambda reading, record: None if record is None else traces.add(record))
         references: dict[int, Any] = {}
+        afterwards = None
+        if o.after_flight:
+            from magmav.afterwards import Afterwards
+
+            afterwards = Afterwards()
         timeline = Timeline(o.every) if o.every is not None else None
         if timeline is not None:
             watchers.append(timeline)
@@ -61,7 +68,10 @@ def replay(o: argparse.Namespace) -> int:
             reference_csv=o.reference,
             watchers=watchers,
             references=references,
+            tap=None if afterwards is None else afterwards.tap,
         )
+    if afterwards is not None:
+        afterwards.add_to(result, references)
     if timeline is not None:
         result["timeline"] = timeline.rows
     if traces is not None:

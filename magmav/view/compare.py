@@ -15,7 +15,8 @@ _NONE = "-"
 _STATES = {"NO_DATA": "no data", "LEARNING": "learning", "READY": "ready", "REFUSED": "refused"}
 _FOOT = """offset: to be added, mG, body axes; - where a method says nothing of an axis.  fit: its own RMS residual, mG.
 second half: fitted on the first half of the time that taught, heading RMS on the rest, deg; p95: of its size.
-in-sample: fitted and scored on everything.  us: microseconds a sample."""
+in-sample: fitted and scored on everything.  us: microseconds a sample.
+adaptive_both: adaptive after the flight, run both ways; in-sample with the iron of each moment, no gate asked."""
 
 
 def compare_view(result: Json) -> RenderableType:
@@ -59,7 +60,7 @@ def _table(compass: Json) -> Table:
             _number(row["residual_mg"], 1),
             *_headings(row),
             _number(row["us_per_sample"], 0),
-            Text(_STATES[row["state"]] if row["refusal"] is None else "no answer"),
+            Text(_STATES.get(row["state"], _NONE) if row["refusal"] is None else "no answer"),
         )
     return table
 
@@ -82,6 +83,6 @@ def _why(rows: Sequence[Json]) -> list[str]:
             continue
         if row["weak"] is not None:
             said.setdefault(f"weak: {row['weak']}", []).append(row["name"])
-        if row["state"] != "READY":
+        if row["state"] not in (None, "READY"):
             said.setdefault(", ".join(row["reasons"]), []).append(row["name"])
     return [f"{', '.join(names)}: {why}" for why, names in said.items()]

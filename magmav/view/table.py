@@ -188,7 +188,7 @@ def _compass(compass: Json) -> RenderableType:
     lines += [_para(f"    - {_word(r.get('text') or r.get('code'))}") for r in compass.get("reasons") or []]
     lines += [_para(f"    ! {_word(c.get('text') or c.get('code'))}") for c in compass.get("causes") or []]
     stored = ", ".join(f"{_word(n)} {_number(v, 'g')}" for n, v in (compass.get("stored") or {}).items())
-    facts = [_para(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass)]
+    facts = [_para(f"  The autopilot holds: {stored or UNKNOWN}"), *_headings(compass), *_afterwards(compass)]
     card = card_view(compass.get("deviation_card") or [])
     return Group(Text(), *lines, table, *facts, *([Text(), card] if compass.get("deviation_card") else []))
 
@@ -219,6 +219,22 @@ def _headings(compass: Json) -> list[RenderableType]:
         out.append(_para(f"    with an upload of offsets alone: {_number(only.get('rms_deg'))} deg"))
     out.append(_para(f"    over {_word(heading.get('n'))} samples, {span} of boot time{left_out}", "dim"))
     return out
+
+
+def _afterwards(compass: Json) -> list[RenderableType]:
+    """What all of the flight shows, where that was asked for."""
+    if "after_flight" not in compass:
+        return []
+    known = compass["after_flight"]
+    if known is None:
+        return [_para("  After the flight, run both ways: nothing is known")]
+    offsets, sigma = _triple(known["offsets_mg"], "+.1f"), _triple(known["sigma_mg"], ".1f")
+    out = [f"  After the flight, run both ways: offsets {offsets} mG (one sigma {sigma})"]
+    if known["changes_s"]:
+        out.append(f"    the iron changed at {', '.join(_number(t, '.1f') for t in known['changes_s'])} s of boot time")
+    if known["heading"] is not None:
+        out.append(f"    heading RMS with the iron of each moment: {_number(known['heading']['rms_deg'])} deg")
+    return [_para(line) for line in out]
 
 
 def _reference(compass: Json) -> str:

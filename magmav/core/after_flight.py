@@ -1,0 +1,387 @@
+"""After the flight: the iron of every second with all of the flight known, the adaptive estimator run both ways.
+
+One bank goes over the Samples, another goes over them from the end, and core.two_filter makes their beliefs of a moment
+into one. Time turned round: a step or a gap belongs to the way between two samples, so it goes to the other end of it.
+The own frame of a sample, its rates, and with them the compass's delay, stay as they are. Only the gyro's bias changes
+sign: it turns the heading by so much a second, and the seconds run the other way.
+
+Each side sees a sudden change of the iron only once it is past it. The change lies where the forward innovations stop
+being small and, coming from the other end, the backward ones do. There both are told to let the iron go and are run
+once more: the belief on either side then owes nothing to the other's iron, but everything else. A young belief is
+easily surprised where nothing happened, so that a side that is surprised alone is heeded only in its later half.
+
+What was turned by hand before the flight is another flight to the estimator, and is left out where anything flew.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magmav.core.estimators.adaptive import AdaptiveEstimator
+from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.bank import Bank
+from magmav.core.estimators.adaptive.block import Block
+from magmav.core.estimators.adaptive.change import ChangeWatch
+from magmav.core.estimators.adaptive.layout import Array
+from magmav.core.estimators.adaptive.measurement import equation
+from magmav.core.estimators.adaptive.process import advance
+from magmav.core.estimators.adaptive.tuning import Tuning
+from magmav.core.rotation import TAU, body_from_earth
+from magmav.core.two_filter import noted, product
+from magmav.core.types import Estimate, Sample, mat3
+
+_EVERY_NS = 1_000_000_000
+_LATE_NS = 5_000_000_000  # a change is noticed within so long
+_CLEAR = 25.0  # chi squared of three axes beyond which the two irons are two: once in 60 000
+_SURE_RAD = math.radians(20.0)  # then the side that begins at the end looks for north on that side only
+_LEAST_MG, _SHARE = 80.0, 1.5  # the iron is let go by at least so much, and so many times the change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AfterFlight:
+    """What is known of the iron of every moment with the whole flight known.
+
+    boot_ns : (N,) increasing, about a second apart.  estimates : N of them; their hard iron is at the same throttle as
+    the estimator's own.  changes_ns : the iron changed suddenly right after these.
+    """
+
+    boot_ns: NDArray[np.int64]
+    estimates: tuple[Estimate, ...]
+    changes_ns: tuple[int, ...]
+
+    @property
+    def answer(self) -> Estimate:
+        """Of the flight as a whole: the iron at its end, which is what the vehicle carries on.
+
+        Where the iron stayed, every moment says the same to its sigma; where it moved, the end is what counts.
+        """
+        return self.estimates[-1]
+
+    def iron_b_mg(self, boot_ns: NDArray[np.int64]) -> Array:
+        """Hard iron at these times, (M,), as (M, 3) mG: between two moments in proportion, across a change not."""
+        out = np.empty((len(boot_ns), 3))
+        iron = np.array([e.hard_iron_b_mg for e in self.estimates])
+        edges = np.array(self.changes_ns, dtype=np.int64)
+        part_of = np.searchsorted(edges, self.boot_ns), np.searchsorted(edges, boot_ns)
+        for part in np.unique(part_of[1]):
+            mine, wanted = part_of[0] == part, part_of[1] == part
+            for axis in range(3):
+                out[wanted, axis] = np.interp(boot_ns[wanted], self.boot_ns[mine], iron[mine, axis])
+        return out
+
+    def iron_of(self, samples: Sequence[Sample]) -> Array:
+        """Hard iron at the moment each of them was measured, (M, 3) mG."""
+        return self.iron_b_mg(np.array([s.boot_ns - round(1e9 * s.age_s) for s in samples], dtype=np.int64))
+
+
+def after_flight(samples: Sequence[Sample], tuning: Tuning | None = None) -> AfterFlight | None:
+    """The iron along one stretch of one compass; None where nothing is known of it.
+
+    samples : as the estimator was given them, in order of time; of one boot, undone with one set of stored values.
+    """
+    flown = _framed(_flown(samples))
+    if not flown:
+        return None
+    run = _BothWays(flown, tuning)
+    changes = run.changes()
+    if changes or run.startled:
+        run = _BothWays(flown, tuning, changes, run.middle_ns)
+    known = [(t, e) for t, e in run.estimates() if e is not None]
+    if not known:
+        return None
+    times = np.array([t for t, _ in known], dtype=np.int64)
+    return AfterFlight(times, tuple(e for _, e in known), tuple(sorted(t for t in changes if t > times[0])))
+
+
+# ---------------------------------------------------------------- samples, and time turned round
+
+
+def _flown(samples: Sequence[Sample]) -> list[Sample]:
+    """The last stretch that taught and was not in somebody's hands; all that taught where nothing flew."""
+    in_hands = False
+    runs: list[tuple[bool, list[Sample]]] = []
+
+    def hands(s: Sample) -> bool:
+        nonlocal in_hands
+        in_hands = s.by_hand if s.learn else in_hands  # what does not teach belongs to what came before
+        return in_hands
+
+    runs = [(held, list(run)) for held, run in groupby(samples, key=hands)]
+    taught = [(held, run) for held, run in runs if any(s.learn for s in run)]
+    if not taught:
+        return []
+    aloft = [run for held, run in taught if not held]
+    return (aloft or [run for _, run in taught])[-1]
+
+
+def _framed(samples: Sequence[Sample]) -> list[Sample]:
+    """Each with its own frame, so that no yaw need be summed; and the field known from the first on."""
+    model_mg = next((s.model_mg for s in samples if s.learn and s.model_mg is not None), None)
+    out: list[Sample] = []
+    yaw = 0.0
+    for s in samples:
+        yaw += s.yaw_step_rad
+        if s.body_from_own is None:
+            frame = mat3(body_from_earth(s.roll_rad, s.pitch_rad, yaw), "own frame")
+            s = replace(s, body_from_own=frame)
+        out.append(s if s.model_mg is not None or model_mg is None else replace(s, model_mg=model_mg))
+    return out
+
+
+def backwards(samples: Sequence[Sample]) -> list[Sample]:
+    """The same with time turned round. Twice turned, all but the first's step and gap are as they were."""
+    if not samples:
+        return []
+    last = replace(samples[-1], dt_s=0.0, yaw_step_rad=0.0, gap=False)
+    rest = zip(reversed(samples[:-1]), reversed(samples[1:]), strict=True)
+    return [last, *(replace(s, dt_s=n.dt_s, yaw_step_rad=-n.yaw_step_rad, gap=n.gap) for s, n in rest)]
+
+
+# ---------------------------------------------------------------- one way
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """One block: boot times of its ends, and the square of its innovation's mean, mG^2."""
+
+    from_ns: int
+    to_ns: int
+    square_mg2: float
+
+
+class _Watch(ChangeWatch):
+    """May be deaf for a while."""
+
+    deaf = False
+
+    def step(self, white: Array, innovation_mg: Array, like: float, disturbance: float, dt_s: float) -> bool:
+        """As ever, but nothing happened while deaf."""
+        since_s = self.since_s + dt_s
+        heard = super().step(white, innovation_mg, like, disturbance, dt_s)
+        if heard and self.deaf:
+            self.since_s = since_s
+        return heard and not self.deaf
+
+
+class _Pass(AdaptiveEstimator):
+    """The estimator, one way; it keeps what it met.
+
+    deaf : within these boot times no change is noticed.  alpha_rad : about where it begins; None: anywhere.
+    """
+
+    def __init__(self, tuning: Tuning | None, deaf: tuple[float, float], alpha_rad: float | None = None) -> None:
+        super().__init__(tuning)
+        self._alpha_rad = alpha_rad
+        self._change: _Watch = _Watch(self.tuning)
+        self._deaf = deaf
+        self.seen: list[_Seen] = []
+        self.changed: list[_Seen] = []  # the blocks at which a change was noticed
+        self._ends = (0, 0)
+
+    def _prior(self, s: Sample, z: Array, down_b: Array) -> tuple[float, float, float, float]:
+        self.field = super()._prior(s, z, down_b)
+        return self.field
+
+    def _learn(self) -> None:
+        ends = [self._gathering._samples[i].boot_ns for i in (0, -1)]
+        self._ends = min(ends), max(ends)
+        if self._alpha_rad is not None and self._bank is not None and not self.seen:
+            away = np.abs((self._bank.x[:, at.ALPHA] - self._alpha_rad + math.pi) % TAU - math.pi)
+            self._bank.keep(np.flatnonzero(away < 1.51 * TAU / self.tuning.yaws))  # three directions
+        super()._learn()
+
+    def _update(self, bank: Bank, block: Block) -> None:
+        best = int(np.argmax(bank.log_weight))
+        foretold = equation(bank.x[best : best + 1], block)[0]
+        mean = (block.z - foretold[0])[:, : block.axes].mean(0)
+        self.seen.append(_Seen(*self._ends, float(mean @ mean)))
+        before_s = self._change.since_s
+        self._change.deaf = self._deaf[0] <= self._ends[0] <= self._deaf[1]
+        super()._update(bank, block)
+        if self._change.since_s < before_s:
+            self.changed.append(self.seen[-1])
+
+    @property
+    def bank(self) -> Bank | None:
+        """What is believed."""
+        return self._bank
+
+    def settle(self) -> None:
+        """Take in what has gathered."""
+        if len(self._gathering):
+            self._learn()
+
+    def let_go(self, sigma_mg: float) -> None:
+        """The iron is another one from here on."""
+        self.settle()
+        if self._bank is not None:
+            self._bank.doubt_iron(sigma_mg)
+            self._change = _Watch(self.tuning)
+            self._change.since_s = 0.0
+
+    def carried_to(self, s: Sample) -> tuple[Bank, bool] | None:
+        """A copy of the bank at the moment of the next sample, not yet taken; and does its heading still count?"""
+        if self._bank is None or s.body_from_own is None:
+            return None
+        n, waiting = self.tuning, self._gathering
+        own = s.tilt_from != "ATTITUDE"
+        bank, down_b = noted(self._bank), s.body_from_own[:, 2]
+        turn_rad2 = waiting._turn_rad2 + ((4.0 if own else 1.0) * n.turn_walk_rad) ** 2 * s.dt_s
+        advance(bank, waiting._dt_s + s.dt_s, waiting._down_s + s.dt_s * down_b, turn_rad2, own, n)
+        return bank, not (s.gap or self._lost)
+
+    def says(self, bank: Bank) -> Estimate | None:
+        """The estimate, had this been believed."""
+        like = copy.copy(self)
+        like._bank = bank
+        return like.estimate(None)
+
+
+# ---------------------------------------------------------------- both ways
+
+
+class _BothWays:
+    """A flight run forwards, then backwards over the same blocks.
+
+    told : the iron changes right after these, by so many mG.  elder_ns : before it the forward side, after it the
+    backward side notices nothing by itself; None: both do always.
+    """
+
+    def __init__(
+        self,
+        samples: Sequence[Sample],
+        tuning: Tuning | None,
+        told: Mapping[int, float] | None = None,
+        elder_ns: float | None = None,
+    ) -> None:
+        self._told = sorted((told or {}).items())
+        self.forward = _Pass(tuning, (-math.inf, -math.inf if elder_ns is None else elder_ns))
+        self.before: dict[int, Bank] = {}
+        self.after: dict[int, tuple[Bank, bool]] = {}
+        self._run_forward(samples)
+        deaf = (math.inf if elder_ns is None else elder_ns, math.inf)
+        self.backward = _Pass(tuning, deaf, self._direction())
+        if self.before:
+            end_ns = max(self.before)
+            self._run_backward([s for s in samples if s.boot_ns <= end_ns])
+
+    def _run_forward(self, samples: Sequence[Sample]) -> None:
+        one, told, due_ns = self.forward, list(self._told), 0
+        for s in samples:
+            while told and s.boot_ns > told[0][0]:
+                one.settle()
+                self._note()
+                one.let_go(told.pop(0)[1])
+                due_ns = 0
+            blocks = len(one.seen)
+            one.step(s)
+            if len(one.seen) > blocks and one.seen[-1].to_ns >= due_ns:
+                due_ns = self._note() + _EVERY_NS
+        if one.seen:
+            self._note()
+
+    def _direction(self) -> float | None:
+        """Where magnetic north lies in the end, rad in the own frame, where that is known at all."""
+        if self.forward.bank is None:
+            return None
+        mean, covariance = self.forward.bank.mixture()
+        return float(mean[at.ALPHA]) if covariance[at.ALPHA, at.ALPHA] < _SURE_RAD**2 else None
+
+    def _note(self) -> int:
+        one = self.forward
+        if one.bank is None or not one.seen:
+            return 0
+        at_ns = one.seen[-1].to_ns
+        self.before.setdefault(at_ns, noted(one.bank))
+        return at_ns
+
+    def _run_backward(self, samples: Sequence[Sample]) -> None:
+        one, told, due = self.backward, list(self._told), sorted(self.before)[:-1]
+        for s in backwards(samples):
+            while told and s.boot_ns <= told[-1][0]:
+                one.let_go(told.pop()[1])
+            if due and s.boot_ns == due[-1]:
+                one.settle()
+                carried = one.carried_to(s)
+                if carried is not None:
+                    self.after[due[-1]] = carried
+                due.pop()
+            one.step(s)
+
+    def estimates(self) -> Iterator[tuple[int, Estimate | None]]:
+        """Of each moment in turn, with all of the flight."""
+        one, n = self.forward, self.forward.tuning
+        begun = Bank.begun(self.backward.field, n) if self.after else None
+        for at_ns, before in sorted(self.before.items()):
+            bank = before
+            if begun is not None and at_ns in self.after:
+                after, heading = self.after[at_ns]
+                bank = product(before, after, begun, n.temper, heading)
+            yield at_ns, one.says(bank)
+
+    # ------------------------------------------------------------ sudden changes
+
+    def changes(self) -> dict[int, float]:
+        """Boot times right after which the iron changed, and how far to let it go, mG."""
+        out: dict[int, float] = {}
+        for from_ns, to_ns in self._windows():
+            at_ns = self._place(from_ns, to_ns)
+            jump_mg = None if at_ns is None else self._jump(at_ns)
+            if at_ns is not None and jump_mg is not None:
+                out[at_ns] = max(_LEAST_MG, _SHARE * jump_mg)
+        return out
+
+    @property
+    def middle_ns(self) -> float:
+        """Half of the flight is before it."""
+        seen = self.forward.seen
+        return 0.5 * (seen[0].from_ns + seen[-1].to_ns) if seen else 0.0
+
+    @property
+    def startled(self) -> bool:
+        """Did a side believe in a change while it knew less than the other?"""
+        young = [c for c in self.forward.changed if c.to_ns < self.middle_ns]
+        return bool(young or [c for c in self.backward.changed if c.from_ns > self.middle_ns])
+
+    def _windows(self) -> list[tuple[int, int]]:
+        """Where to look: between the backward and the forward notice of one change, or where the elder noticed one."""
+        alone = [c.from_ns for c in self.backward.changed]
+        out = []
+        for c in self.forward.changed:
+            partner = max((t for t in alone if 0 <= c.to_ns - t <= 2 * _LATE_NS), default=None)
+            if partner is not None:
+                alone.remove(partner)
+                out.append((partner, c.to_ns))
+            elif c.to_ns > self.middle_ns:
+                out.append((c.to_ns - _LATE_NS, c.to_ns))
+        return out + [(t, t + _LATE_NS) for t in alone if t < self.middle_ns]
+
+    def _place(self, from_ns: int, to_ns: int) -> int | None:
+        """The end of the forward block after which the forward bank is surprised, and before which the backward one."""
+        fore = [b for b in self.forward.seen if b.from_ns >= from_ns and b.to_ns <= to_ns]
+        back = [b for b in self.backward.seen if b.from_ns >= from_ns and b.to_ns <= to_ns]
+        usual = [float(np.median([b.square_mg2 for b in one.seen])) + 1e-9 for one in (self.forward, self.backward)]
+
+        def surprise(at_ns: int) -> float:
+            first = sum(b.square_mg2 for b in fore if b.to_ns <= at_ns) / usual[0]
+            return first + sum(b.square_mg2 for b in back if b.from_ns > at_ns) / usual[1]
+
+        return min((b.to_ns for b in fore), key=surprise, default=None)
+
+    def _jump(self, at_ns: int) -> float | None:
+        """How far the iron before is from the iron after, mG; None where they may be the same."""
+        early, late = (t for t in self.before if t <= at_ns), (t for t in self.after if t >= at_ns)
+        first, then = max(early, default=None), min(late, default=None)
+        if first is None or then is None:
+            return None
+        (x, p), (y, q) = self.before[first].mixture(), self.after[then][0].mixture()
+        away = (y - x)[at.B]
+        chi2 = float(away @ np.linalg.solve((p + q)[at.B, at.B], away))
+        return math.hypot(*away.tolist()) if chi2 > _CLEAR else None
