@@ -21,7 +21,7 @@ from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
 from magmav.core.published import Publisher, noise_of_heading
-from magmav.core.rotation import wrap_tau
+from magmav.core.rotation import wrap_pi, wrap_tau
 from magmav.core.types import (
     ZERO3,
     AttitudeReading,
@@ -56,6 +56,7 @@ from magmav.settings import Settings
 _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
 _SAY_FROZEN_NS = 1_000_000_000
 _DOUBTED_S = 5.0  # after a sudden change the answer is still on its way: the gyro holds the own yaw
+_STEERS_RAD = math.radians(20.0)  # a heading less sure than this does not move the own yaw
 _ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 
 
@@ -259,15 +260,15 @@ class Vehicle:
 
         Own tilt and turning never hear of the compass, so nothing learnt with them confirms itself.
         """
-        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not f.heading.valid:
+        sure = f.heading.valid and f.heading.sigma_rad < _STEERS_RAD
+        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not sure:
             return f
         motion = self.assembler.motion
         if f.verdict.state is not State.REFUSED and f.estimate.changed_ago_s >= _DOUBTED_S:
             motion.field(f.corrected_b_mg, s.age_s + f.estimate.delay_s, f.heading.sigma_rad)
-        yaw = motion.magnetic_yaw(s.boot_ns)
-        if yaw is None:
+        yaw, was = motion.magnetic_yaw(s.boot_ns), f.heading
+        if yaw is None or abs(wrap_pi(yaw - was.magnetic_rad)) > 3.0 * _STEERS_RAD:  # it began wrong: let it be
             return f
-        was = f.heading
         true = wrap_tau(was.true_rad + yaw - was.magnetic_rad) if was.true_valid else 0.0
         return replace(f, heading=replace(was, magnetic_rad=yaw, true_rad=true))
 

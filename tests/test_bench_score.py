@@ -186,7 +186,7 @@ def test_a_rival_is_beaten_only_where_the_whole_interval_says_so(judged):
 
 def test_the_command_says_the_same_twice_and_refuses_by_name(tmp_path, capsys):
     file = tmp_path / "runs.json"
-    arguments = "--seeds 7:8 --scenarios slow2 --estimators taubin --peers twostep --jobs 1 --no-bound"
+    arguments = "--seeds 7:8 --scenarios slow2 --estimators taubin --peers twostep_batch --jobs 1 --no-bound"
     assert estimators.main([*arguments.split(), "--json", str(file)]) == 0
     assert "TUNING" in capsys.readouterr().out
     first = json.loads(file.read_text())["runs"]

@@ -27,7 +27,7 @@ from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample,
 
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
-_GUESS_RAD = math.radians(45.0)  # a heading less sure than this is not published
+_GUESS_RAD = math.radians(20.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
 _FIELD_WEIGHT = 0.04  # five times a second: a memory of five seconds
 

@@ -94,7 +94,7 @@ class Motion:
         euler = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)
         dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
         if last is None:
-            yaw, frame = 0.0, of_attitude(r.roll_rad, r.pitch_rad, r.yaw_rad)
+            yaw, frame = 0.0, of_attitude(r.roll_rad, r.pitch_rad, 0.0)
         elif dt <= _RATES_HOLD_S:
             yaw = last.yaw_rad + 0.5 * (last.euler_rads[2] + euler[2]) * dt
             p, q, w = last.rate_b_rads

@@ -23,13 +23,14 @@ from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.process import advance
-from magmav.core.estimators.adaptive.robust import WildGate, adapt, between, doubted
+from magmav.core.estimators.adaptive.robust import Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
+_DOWN = np.diag((0.0, 0.0, 1.0))
 _FLOOR_MG = (
     0.5,
     0.5,
@@ -46,6 +47,7 @@ class AdaptiveEstimator:
         self._bank: Bank | None = None
         self._gathering = Gathering()
         self._wild = WildGate()
+        self._tilting = Tilting()
         self._change = ChangeWatch(self.tuning)
         self._own_yaw_rad = 0.0
         self._lost = False
@@ -91,7 +93,9 @@ class AdaptiveEstimator:
             self._bank = Bank.begun(self._prior(s, z, down_b), n)
         if self._by_hand and not s.by_hand:
             self._leave_ground(s, z, down_b)
+            gathering = self._gathering
         self._by_hand = s.by_hand
+        self._tilting.step(down_b)
         if self._model_mg is None and s.model_mg is not None:
             self._model_mg = s.model_mg
             self._bank.tell_field(*s.model_mg, n)
@@ -99,9 +103,7 @@ class AdaptiveEstimator:
         if len(gathering) == n.block_readings or gathering.span_s + dt > n.block_s:
             self._learn()
 
-    def _prior(
-        self, s: Sample, z: Array, down_b: Array
-    ) -> tuple[float, float, float, float]:
+    def _prior(self, s: Sample, z: Array, down_b: Array) -> tuple[float, float, float, float]:
         n = self.tuning
         self._model_mg = s.model_mg
         if s.model_mg is not None:
@@ -115,6 +117,7 @@ class AdaptiveEstimator:
         assert self._bank is not None
         iron_mg = self._bank.mixture()[0][at.B]
         self._bank = Bank.begun(self._prior(s, z, down_b), self.tuning, iron_mg)
+        self._tilting = Tilting()
         self._gathering = Gathering()
         self._samples = self._blocks = self._residual_n = 0
 
@@ -149,18 +152,15 @@ class AdaptiveEstimator:
         np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
         strange = doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)
-        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(
-            1
-        )
+        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(1)
         flat = nu.reshape(count, size * k)
         pull = (inverse @ flat[:, :, None])[:, :, 0]
         nis = (flat * pull).sum(1)
         gain = pj @ inverse
         bank.x += (pj @ pull[:, :, None])[:, :, 0]
         bank.p -= gain @ pj.transpose(0, 2, 1)
-        bank.p = 0.5 * (
-            bank.p + bank.p.transpose(0, 2, 1)
-        )  # rounding must not grow into asymmetry
+        bank.p = 0.5 * (bank.p + bank.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
+        bank.upright()
         bank.weigh(-0.5 * (nis + log_det), block.dt_s, n)
         best = int(np.argmax(bank.log_weight))
         mean = nu.sum(1) / size
@@ -170,22 +170,15 @@ class AdaptiveEstimator:
             adapt(bank, nu, white, bank.common_mg2[:, None] / variance, block.dt_s, n)
             push = bank.x[best, at.D] / bank.disturbance_mg[best]
             like = float(bank.product[best] / max(bank.square[best], 0.1))
-            if self._change.step(
-                white[best], mean[best], like, float(push @ push), block.dt_s
-            ):
+            changed = self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s)
+            if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._change.open(bank)
                 self._residual_n = 0
-        self._nis += min(block.dt_s, 0.5) * (
-            float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis
-        )
-        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(
-            size, k
-        ) + bank.x[best, at.D][:k]
+        self._nis += min(block.dt_s, 0.5) * (float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis)
+        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
-        self._residual_mg2 += weight * (
-            float((left * left).sum()) / (k * size) - self._residual_mg2
-        )
+        self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
 
     # ------------------------------------------------------------ answer
 
@@ -200,6 +193,11 @@ class AdaptiveEstimator:
         own = covariance
         if self._model_mg is not None:
             own = without_prior(covariance, *self._model_mg, self.tuning)
+        if self._tilting.rms_rad < self.tuning.least_tilt_rad:  # it may be the attitude's own noise that tilts
+            unknown = np.zeros((at.SIZE, at.SIZE))
+            unknown[at.B, at.B] = _DOWN * self.tuning.blind_v_mg**2
+            own = own + unknown
+            covariance = covariance if self._model_mg is not None else covariance + unknown
         return Estimate(
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
             covariance_mg2=take @ covariance @ take.T,

@@ -25,17 +25,11 @@ def field_covariance(h_mg: float, v_mg: float, n: Tuning) -> Array:
 class Bank:
     """All hypotheses side by side: x (K, n), p (K, n, n), and for each its model, log weight and noise."""
 
-    def __init__(
-        self, x: Array, p: Array, model: Index, log_weight: Array, n: Tuning
-    ) -> None:
+    def __init__(self, x: Array, p: Array, model: Index, log_weight: Array, n: Tuning) -> None:
         self.x, self.p, self.model, self.log_weight = x, p, model, log_weight
         k = len(x)
-        self.white_mg2 = np.full(
-            k, n.white_mg**2
-        )  # variance of one reading's own noise
-        self.common_mg2 = np.full(
-            k, n.common_mg**2
-        )  # of what all readings of a block share
+        self.white_mg2 = np.full(k, n.white_mg**2)  # variance of one reading's own noise
+        self.common_mg2 = np.full(k, n.common_mg**2)  # of what all readings of a block share
         self.disturbance_mg = np.full(k, n.disturbance_mg)
         self.square, self.product = (
             np.ones(k),
@@ -43,9 +37,7 @@ class Bank:
         )  # of the whitened mean innovation, and with its neighbour
         self.last = np.zeros((k, 3))  # the one before
         self.seen_s = 0.0
-        self.walk_mg = np.array(
-            [MODELS[m].iron_walk_mg for m in model]
-        )  # per square root of a second
+        self.walk_mg = np.array([MODELS[m].iron_walk_mg for m in model])  # per square root of a second
         self.prior = np.log([MODELS[m].weight for m in model])
 
     @staticmethod
@@ -71,18 +63,14 @@ class Bank:
             x[:, at.B] = iron_mg
             diagonal[:, at.B] = n.ground_mg**2
         diagonal[:, at.H], diagonal[:, at.V] = h_sigma**2, v_sigma**2
-        p[:, at.H : at.V + 1, at.H : at.V + 1] += field_covariance(
-            h, v, n
-        ) - n.model_mg**2 * np.eye(2)
+        p[:, at.H : at.V + 1, at.H : at.V + 1] += field_covariance(h, v, n) - n.model_mg**2 * np.eye(2)
         diagonal[:, at.E] = n.tilt_rad**2
         diagonal[:, at.D] = n.disturbance_mg**2
         diagonal[:, at.K] = n.throttle_mg**2
         for m, one in enumerate(MODELS):
             rows = model == m
             diagonal[rows, at.R] = one.mounting_rad**2
-            diagonal[rows, at.S] = np.repeat(
-                (one.soft_diagonal**2, one.soft_cross**2), 3
-            )
+            diagonal[rows, at.S] = np.repeat((one.soft_diagonal**2, one.soft_cross**2), 3)
         diagonal[:, at.G] = n.gyro_rads**2
         diagonal[:, at.T] = n.delay_s**2
         diagonal[:, at.KAPPA] = n.kappa**2
@@ -92,19 +80,14 @@ class Bank:
     def lose_heading(self, n: Tuning) -> None:
         """Any heading again: the best of each model goes on from every direction, with all else that it knows."""
         w = self.weights()
-        best = [
-            max(np.flatnonzero(self.model == m), key=lambda i: w[i])
-            for m in np.unique(self.model)
-        ]
+        best = [max(np.flatnonzero(self.model == m), key=lambda i: w[i]) for m in np.unique(self.model)]
         share = np.array([w[self.model == self.model[i]].sum() for i in best])
         self.keep(np.repeat(best, n.yaws))
         self.log_weight = np.log(np.repeat(share / n.yaws, n.yaws) + 1e-300)
         self.x[:, at.ALPHA] += np.tile(np.arange(n.yaws) * TAU / n.yaws, len(best))
         self.p[:, at.ALPHA, :] = self.p[:, :, at.ALPHA] = 0.0
         self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
-        self.x[:, at.E] = self.p[:, at.E, :] = self.p[:, :, at.E] = (
-            0.0  # it was about axes that are lost
-        )
+        self.x[:, at.E] = self.p[:, at.E, :] = self.p[:, :, at.E] = 0.0  # it was about axes that are lost
         np.einsum("kii->ki", self.p)[:, at.E] = n.tilt_rad**2
 
     def doubt_iron(self, sigma_mg: float) -> None:
@@ -124,6 +107,15 @@ class Bank:
         self.p -= gain @ self.p[:, hv, :]
         self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))
 
+    def upright(self) -> None:
+        """A level field of negative strength points the other way: the same, said as everybody says it."""
+        over = self.x[:, at.H] < 0.0
+        if over.any():
+            self.x[over, at.H] *= -1.0
+            self.x[over, at.ALPHA] += math.pi
+            self.p[over, at.H, :] *= -1.0
+            self.p[over, :, at.H] *= -1.0
+
     def __len__(self) -> int:
         return len(self.x)
 
@@ -140,11 +132,7 @@ class Bank:
     def weigh(self, log_likelihood: Array, dt_s: float, n: Tuning) -> None:
         """Better foretold, more believed; old merit fades, so that a model can come back."""
         fade = math.exp(-dt_s / n.forget_s)
-        self.log_weight = (
-            fade * self.log_weight
-            + (1.0 - fade) * self.prior
-            + n.temper * log_likelihood
-        )
+        self.log_weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
         self.log_weight -= self.log_weight.max()
 
     def tidy(self, n: Tuning, most: int) -> None:
@@ -159,24 +147,18 @@ class Bank:
                 continue
             if w[i] < n.prune_below * w[order[0]] or len(kept) >= most:
                 continue
-            twin = next(
-                (j for j in same if self._alike(int(i), j, n.merge_sigma)), None
-            )
+            twin = next((j for j in same if self._alike(int(i), j, n.merge_sigma)), None)
             if twin is None:
                 kept.append(int(i))
             else:
-                self.log_weight[twin] = np.logaddexp(
-                    self.log_weight[twin], self.log_weight[i]
-                )
+                self.log_weight[twin] = np.logaddexp(self.log_weight[twin], self.log_weight[i])
         self.keep(np.array(sorted(kept)))
 
     def _alike(self, i: int, j: int, line: float) -> bool:
         sigma = np.sqrt(np.diagonal(self.p[j]))
         away = math.remainder(self.x[i, 0] - self.x[j, 0], TAU)
         iron = np.abs(self.x[i, at.B] - self.x[j, at.B])
-        return abs(away) < line * sigma[0] + 1e-3 and bool(
-            (iron < line * sigma[at.B] + 0.5).all()
-        )
+        return abs(away) < line * sigma[0] + 1e-3 and bool((iron < line * sigma[at.B] + 0.5).all())
 
     def mixture(self) -> tuple[Array, Array]:
         """Mean (n,) and covariance (n, n) of all together; alpha the short way round."""
@@ -186,7 +168,5 @@ class Bank:
         x[:, 0] = x[best, 0] + (x[:, 0] - x[best, 0] + math.pi) % TAU - math.pi
         mean = w @ x
         away = x - mean
-        covariance = np.einsum("k,kij->ij", w, self.p) + np.einsum(
-            "k,ki,kj->ij", w, away, away
-        )
+        covariance = np.einsum("k,kij->ij", w, self.p) + np.einsum("k,ki,kj->ij", w, away, away)
         return mean, covariance

@@ -72,11 +72,7 @@ class Gathering:
         if not self._samples:
             return True
         last = self._samples[-1]
-        return (
-            s.shaping is last.shaping
-            and s.axes == last.axes
-            and s.tilt_from == last.tilt_from
-        )
+        return s.shaping is last.shaping and s.axes == last.axes and s.tilt_from == last.tilt_from
 
     def passes(self, dt_s: float, down_b: Array, turn_rad2: float) -> None:
         """Time goes by."""

@@ -16,9 +16,7 @@ from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array
 
 _EYE3 = np.eye(3)
-_PLACES = np.array(
-    (0, 3, 4, 3, 1, 5, 4, 5, 2)
-)  # where each entry of S stands among the six
+_PLACES = np.array((0, 3, 4, 3, 1, 5, 4, 5, 2))  # where each entry of S stands among the six
 
 
 def soft_matrix(s: Array) -> Array:
@@ -28,12 +26,7 @@ def soft_matrix(s: Array) -> Array:
 
 
 # (3, 18): u times this is S u as a matrix of the six of S
-_SOFT = np.stack(
-    [
-        np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel()
-        for unit in _EYE3
-    ]
-)
+_SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel() for unit in _EYE3])
 
 
 def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
@@ -47,9 +40,7 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     j[..., at.D] = _EYE3
     angle = (x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T)[:, :, None]
     c, s = np.cos(angle), np.sin(angle)
-    ahead = (
-        c * block.north_b + s * block.east_b
-    )  # the horizontal field's direction, and a right angle on from it
+    ahead = c * block.north_b + s * block.east_b  # the horizontal field's direction, and a right angle on from it
     beside = c * block.east_b - s * block.north_b
     h = x[:, at.H, None, None]
     u = h * ahead + x[:, at.V, None, None] * block.down_b
@@ -61,9 +52,7 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     j[..., at.E.start + 1] = v * block.north_b - h * c * block.down_b
     j[..., 1, at.R.start], j[..., 2, at.R.start] = -u[..., 2], u[..., 1]
     j[..., 0, at.R.start + 1], j[..., 2, at.R.start + 1] = u[..., 2], -u[..., 0]
-    moved = (
-        j[..., at.E] @ x[:, None, at.E, None] + j[..., at.R] @ x[:, None, at.R, None]
-    )[..., 0]
+    moved = (j[..., at.E] @ x[:, None, at.E, None] + j[..., at.R] @ x[:, None, at.R, None])[..., 0]
     moved += x[:, at.KAPPA, None, None] * leaning + x[:, at.T, None, None] * late
     seen = u + moved
     soft = soft_matrix(x[:, at.S])
