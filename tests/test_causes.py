@@ -13,7 +13,7 @@ from pathlib import Path
 import memory_flight
 import numpy as np
 import pytest
-from honest_flight import EXPECTED, MOTIONS, RATE_HZ, field_in_body, samples, wander
+from honest_flight import EXPECTED, MOTIONS, RATE_HZ, Motion, field_in_body, samples, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_flight import EARTH_MG, HARD_IRON_MG
@@ -113,10 +113,16 @@ def test_derivatives_agree_with_finite_differences():
     r = np.random.default_rng(3)
     late = np.array([0.0, 0.0, 1.0, 1.0])
     shared = np.array([430.0, 9, 8, 7, 1, 2, 3, 4, 5, 6])
-    state = causes_fit._State(about(x=20, z=70), shared, r.normal(0, 200, (4, 2)), 1.1, late)
+    state = causes_fit._State(about(x=20, z=70), shared, r.normal(0, 200, (4, 2)), 1.1, late, r.normal(0, 0.5, 3))
     state = state.moved(
         np.concatenate(
-            [r.normal(0, 0.02, 9), r.normal(0, 5, 6), r.normal(0, 5, 2), [0.02], r.normal(0, 5, 3), np.zeros(4)]
+            [
+                *(r.normal(0, s, n) for s, n in ((0.02, 9), (5, 6), (5, 2))),
+                [0.02],
+                r.normal(0, 5, 3),
+                r.normal(0, 9, 9),
+                np.zeros(4),
+            ]
         )
     )
     by = state.derivatives(causes_fit.AMPERE)
@@ -522,3 +528,57 @@ def test_a_sample_is_never_changed_by_being_watched():
     before = s.mag_b_mg.tobytes()
     watch([s])
     assert s.mag_b_mg.tobytes() == before
+
+
+# ---------------------------------------------------------------- what a motion cannot show
+
+
+def flat(t, r):
+    """A rover driving curves both ways over ground a third of a degree off level."""
+    rate, phase = r.uniform([0.25, 0.7, 1.4], [0.5, 1.2, 2.4], (2, 3)), r.uniform(0.0, 6.3, (2, 3))
+    waves = np.sin(rate[:, :, None] * t + phase[:, :, None]).sum(axis=1)
+    a, b = r.uniform(0.0, 6.0, 2)
+    return Motion(*(np.radians(0.25) * waves), a + 3.5 * np.sin(t / 11.0 + b) + 0.03 * t)
+
+
+@pytest.fixture
+def on_the_flat(monkeypatch):
+    """Three minutes of it by seed; the attitude errs by more than the vehicle tilts."""
+    monkeypatch.setitem(MOTIONS, "flat", flat)
+    return lambda seed: samples("flat", seed, seconds=180.0, tilt_deg=0.45)
+
+
+def test_on_the_flat_a_turn_about_the_down_axis_is_not_shown_and_its_sigma_says_so(on_the_flat):
+    """The attitude's errors, taken for tilts, must neither turn the mounting nor weaken the field."""
+    off = []
+    for seed in range(6):
+        f = fitted(on_the_flat(seed))
+        spread = np.sqrt(np.diag(f.covariance))
+        assert spread[8] > math.radians(15.0) > spread[6]
+        off.append([*(turn_of(f.turn) / spread[causes_fit.TURN]), (f.gain - 1.0) / spread[0]])
+    assert np.all(np.abs(np.mean(off, axis=0)) < 1.2), off
+    assert np.abs(off).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ("matrix", "expected"),
+    [
+        (GRID, set()),
+        (about(z=30), set()),
+        (about(y=15), {"MOUNTED_CROOKED"}),
+        (about(x=180), {"MOUNTED_WRONG"}),
+        (1.3 * GRID, {"SCALE_WRONG"}),
+    ],
+    ids=["sound", "turned flat", "nose down", "upside down", "strong"],
+)
+def test_on_the_flat_what_turning_shows_is_named_and_nothing_else(on_the_flat, matrix, expected):
+    assert codes(watch(bent(on_the_flat(3), matrix))) == expected
+
+
+def test_an_estimator_that_searches_does_not_take_the_data_away():
+    """A compass turned on its mount makes an estimator call one sudden change after the other: they are no change."""
+    found = Causes()
+    for i, s in enumerate(bent(samples("figure eight", 27), about(z=90))):
+        called = replace(NOTHING, changed_ago_s=1e9 if i < 40 else (0.1 * (i - 40)) % 4.0)
+        found.step(s, called, EXPECTED, vec3(s.mag_b_mg - HARD_IRON_MG, "u"), False)
+    assert "MOUNTED_WRONG" in codes(found)

@@ -46,6 +46,7 @@ _POWER_CHI2 = 40.0
 _GROUND_MG, _AZIMUTH_RAD = 40.0, math.radians(4.0)
 _JUMP_MG, _JUMP_CHI2, _JUMP_FLOOR_MG = 30.0, 50.0, 2.0
 _BAD_MG, _BAD_TIMES = 15.0, 2.5
+_SEARCHES_S = 15.0
 _FIT_AT = (3, 6, 12, 24)  # blocks; later every 15
 
 
@@ -161,8 +162,11 @@ class Causes:
             w.magnet = Cause("MAGNET_NEARBY", text, {"field_mg": strength})
 
     def _changes(self, w: _Watched, e: Estimate) -> None:
-        """The estimator says that the iron changed suddenly: what came before may be another compass's story."""
-        if e.changed_ago_s < w.changed_ago_s - 1.0:
+        """The estimator says that the iron changed suddenly: what came before may be another compass's story.
+
+        Said again soon after, it is the estimator that searches: of a compass turned on its mount it finds no end.
+        """
+        if e.changed_ago_s < w.changed_ago_s - 1.0 and w.changed_ago_s > _SEARCHES_S:
             w.era += 1
         w.changed_ago_s = e.changed_ago_s
 
@@ -175,10 +179,12 @@ class Causes:
             return
         w.fitted_at = at
         blocks, step_at = _since_the_last_change(blocks)
-        now = fit(blocks, w.expected, step_at)
+        # What stands around while it is turned by hand makes the field another than the world model's.
+        expected = None if w.blocks.by_hand else w.expected
+        now = fit(blocks, expected, step_at)
         w.fitted = now
         ground = None if w.blocks.ground is None else _ground(now, blocks, w.blocks.ground)
-        found = (_changed(now), _mounting(now), _scale(now, w.expected), _power(now), _gyro(now), ground)
+        found = (_changed(now), _mounting(now), _scale(now, expected), _power(now), _gyro(now), ground)
         w.found = tuple(c for c in found if c is not None)
 
     def _against_others(self, compass: int) -> tuple[Cause, ...]:

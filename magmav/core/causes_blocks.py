@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,16 +75,29 @@ def _turned(v: Vector, rate_rads: list[float], dt_s: float) -> Vector:
     return x + dt_s * (q * z - r * y), y + dt_s * (r * x - p * z), z + dt_s * (p * y - q * x)
 
 
+class Where(Enum):
+    """What a block was measured in."""
+
+    GROUND = "at rest before take-off"
+    HANDS = "turned by hand before take-off"
+    AIR = "teaching"
+
+
 class Blocks:
-    """The last BLOCKS blocks of what teaches, and the last whole one on the ground before take-off."""
+    """The last BLOCKS blocks of what teaches, and the last whole one at rest on the ground before take-off.
+
+    What was turned by hand teaches until it flies, and no longer: on the ground stands what does not fly along. Nor is
+    it the ground's: the field there is compared at rest, and where it was put down again.
+    """
 
     def __init__(self) -> None:
-        self.air: deque[Block] = deque(maxlen=BLOCKS)
+        self.teaching: deque[Block] = deque(maxlen=BLOCKS)
+        self.by_hand = False  # all that teaches was turned by hand
         self.ground: Block | None = None
         self.closed = 0
         self._standing: list[Block] = []
         self._now: Block | None = None
-        self._standing_now = False
+        self._where = Where.AIR
         self._rows = np.zeros((_BATCH, WIDTH))
         self._filled = 0
         self._yaw_rad = 0.0
@@ -99,10 +113,12 @@ class Blocks:
             self._close()
             self._chained, self._was, self._dt_s = False, None, 0.0
         self._dt_s += max(s.dt_s, 0.0)
-        if not (s.learn or grounded):
+        where = Where.HANDS if s.by_hand else Where.GROUND if grounded else Where.AIR
+        flown = bool(self.teaching) and not self.by_hand
+        if not (s.learn or grounded) or (where is Where.HANDS and flown):
             self._close()
             return
-        if self._now is not None and self._standing_now is not grounded:
+        if self._now is not None and self._where is not where:
             self._close()
         x, y, w = field_of_sample(s).tolist()
         z = (x, y, w)
@@ -114,9 +130,18 @@ class Blocks:
         elif self._now is not None and boot_s - self._now.begin_s >= BLOCK_S:
             self._close()
         if self._now is None:
-            self._now, self._standing_now = Block(boot_s, self._chained, era), grounded
+            self._begin(where)
+            self._now, self._where = Block(boot_s, self._chained, era), where
             self._chained = True
         self._row(self._now, s, z, delay_s, power, boot_s)
+
+    def _begin(self, where: Where) -> None:
+        """Forget what another place has said."""
+        if where is Where.HANDS:
+            self._standing, self.ground, self.by_hand = [], None, True
+        elif where is Where.AIR and self.by_hand:
+            self.teaching.clear()
+            self.by_hand, self.closed = False, 0
 
     def _jumped(self, z: Vector, s: Sample) -> bool:
         """A lone outlier: far from the value before, and not followed by others like it."""
@@ -160,23 +185,23 @@ class Blocks:
         block, self._now = self._now, None
         if block is None:
             return
-        if self._standing_now:
+        if self._where is Where.GROUND:
             # The last one before take-off may already be climbing; the one before it is the ground.
             self._standing = [*self._standing[-1:], block]
             self.ground = self._standing[0]
         elif block.n >= 10:
-            self.air.append(block)
+            self.teaching.append(block)
             self.closed += 1
 
     def _drop(self, boot_s: float) -> None:
         """The iron had changed some time before it was noticed: that time belongs to neither side."""
         self._filled, self._now = 0, None
-        if self.air and boot_s - self.air[-1].begin_s < BLOCK_S + _NOTICED_S:
-            self.air.pop()
+        if self.teaching and boot_s - self.teaching[-1].begin_s < BLOCK_S + _NOTICED_S:
+            self.teaching.pop()
 
     def all(self) -> list[Block]:
         """Every block, the unfinished one too when it holds enough."""
         self._flush()
         now = self._now
-        more = [now] if now is not None and not self._standing_now and now.n >= 10 else []
-        return [*self.air, *more]
+        more = [now] if now is not None and self._where is not Where.GROUND and now.n >= 10 else []
+        return [*self.teaching, *more]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magmav.core.causes_blocks import AMPERE, FEATURES, ONE, THROTTLE, TOP, Block
+from magmav.core.causes_blocks import AMPERE, DOWN, FEATURES, ONE, THROTTLE, TOP, Block
 from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
 
 Array = NDArray[np.float64]
@@ -29,13 +29,14 @@ _POWER = {AMPERE: 10.0, THROTTLE: 200.0}  # mG per ampere, and per full throttle
 _DRIFT = math.radians(2.0)  # rad/s
 _HOP = math.radians(4.0)  # what the gyro may lose from block to block beyond a constant drift: scale, walk
 _TILT = math.radians(0.3)  # what the attitude's slow error leaves in the turn, however long the flight
-_TILT_SIGMA = math.radians(0.5)
+_TILT_ERR = math.radians(0.5)  # of the attitude about each level axis; another one every block
 _LEAST_MG = 3.0  # no fit is believed to be better than this
 _STEPS, _DONE = 14, 0.01  # Gauss-Newton stops when no unknown moves by more of its sigma
 _BETTER = 60.0  # by so much, in chi-squared, a right-angled mounting must beat none
 
 GAIN, SOFT, TURN, IRON, POWER = 0, slice(1, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-LEVEL, DOWNWARD, DRIFT, STEP, SHARED = 15, 16, 17, slice(18, 21), 21
+LEVEL, DOWNWARD, DRIFT, STEP = 15, 16, 17, slice(18, 21)
+TOLD, SHARED = 21, 30  # Fit tells of so many; then what tilting shows beyond, mG by component of g and sensor axis
 
 _SOFT_BASIS = np.array(
     [
@@ -114,7 +115,6 @@ class Fit:
     rms_mg: float
     plain_mg: float
     samples: int
-    plain_cov: Array
 
     def sigma(self, which: int) -> float:
         """One sigma of one of the shared unknowns."""
@@ -135,6 +135,9 @@ class _Problem:
         self.expected = expected
         self.power_by, self.span = self._power()
         self.blocks = len(blocks)
+        x = self.x.sum(axis=0) / self.n
+        self.down = x[ONE, DOWN]
+        self.tilts = x[DOWN, DOWN] - np.outer(self.down, self.down)
 
     def _power(self) -> tuple[int, float]:
         """What drives the motor term: the battery's ampere where they are known and change, else the throttle."""
@@ -202,8 +205,8 @@ def _linear(p: _Problem, turn: Array, variance: float) -> tuple[float, Array, Ar
 class _State:
     """Where Gauss-Newton stands."""
 
-    def __init__(self, turn: Array, shared: Array, level: Array, gain: float, late: Array) -> None:
-        self.start, self.turn, self.late = turn, turn, late
+    def __init__(self, turn: Array, shared: Array, level: Array, gain: float, late: Array, down: Array) -> None:
+        self.start, self.turn, self.late, self.down = turn, turn, late, down
         strength = np.hypot(level[:, 0], level[:, 1])
         self.shared = np.zeros(SHARED)
         self.shared[GAIN] = gain
@@ -214,7 +217,7 @@ class _State:
     def moved(self, by: Array) -> _State:
         """A step away."""
         out = object.__new__(_State)
-        out.start, out.late, out.turn = self.start, self.late, turn_by(by[TURN]) @ self.turn
+        out.start, out.late, out.down, out.turn = self.start, self.late, self.down, turn_by(by[TURN]) @ self.turn
         out.shared, out.azimuth = self.shared + by[:SHARED], self.azimuth + by[SHARED:]
         out.shared[TURN] = turn_of(out.turn @ out.start.T)
         return out
@@ -234,7 +237,9 @@ class _State:
         j = len(self.azimuth)
         out = np.zeros((j, FEATURES, 3))
         out[:, :TOP] = np.einsum("jc,rs->jcsr", self.weights(), self.matrix()).reshape(j, TOP, 3)
-        out[:, ONE] = self.shared[IRON] + self.late[:, None] * self.shared[STEP]
+        beyond = self.shared[TOLD:].reshape(3, 3)
+        out[:, DOWN] += beyond
+        out[:, ONE] = self.shared[IRON] + self.late[:, None] * self.shared[STEP] - self.down @ beyond
         if power_by:
             out[:, power_by] = self.shared[POWER]
         return out
@@ -269,32 +274,12 @@ class _State:
                 out[:, 12 + i, power_by, i] = 1.0
         out[:, LEVEL, :TOP] = top(np.stack([zero, c, s, -w * s, w * c], axis=1), d)
         out[:, DOWNWARD, :TOP] = top(np.tile([1.0, 0, 0, 0, 0], (j, 1)), d)
+        for i in range(9):
+            out[:, TOLD + i, i // 3, i % 3] = 1.0
+            out[:, TOLD + i, ONE, i % 3] = -self.down[i // 3]
         out[:, DRIFT, :TOP] = top(np.stack([zero, zero, zero, -h * s, h * c], axis=1), d)
         out[:, SHARED, :TOP] = top(np.stack([zero, -h * s, h * c, -h * w * c, -h * w * s], axis=1), d)
         return out
-
-
-def _tilted(p: _Problem, state: _State, gain: Array) -> Array:
-    """What a tilt that errs for as long as a block lasts adds to the covariance, (P, P).
-
-    Turned by e about a level axis, g and the other level axis change places: e D (v q - h sin(a) g), and likewise with
-    p. Each block's error goes its own way. gain : (P, P), the change of the answer by that of the right side.
-    """
-    j, d = p.blocks, state.matrix()
-    by, weights = state.derivatives(p.power_by), state.weights()
-    out = np.zeros_like(gain)
-    for level in (1, 2):
-        swapped = np.zeros_like(weights)
-        swapped[:, level], swapped[:, 0] = weights[:, 0], -weights[:, level]
-        field = np.zeros((j, FEATURES, 3))
-        field[:, :TOP] = np.einsum("jc,rs->jcsr", swapped, d).reshape(j, TOP, 3)
-        pull = np.einsum("jpfr,jfr->jp", by, p.x @ field)
-        side = np.zeros((len(gain), j))
-        side[:SHARED] = pull[:, :SHARED].T
-        side[SHARED:][range(j), range(j)] = pull[:, SHARED]
-        moved = gain @ side
-        out += _TILT_SIGMA**2 * moved @ moved.T
-    return out
 
 
 def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
@@ -313,8 +298,9 @@ def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
         sigma[LEVEL] = sigma[DOWNWARD] = MODEL_SIGMA_MG
     information = np.zeros((SHARED + j, SHARED + j))
     side = np.zeros(SHARED + j)
-    information[range(SHARED), range(SHARED)] = sigma**-2.0
-    side[:SHARED] = (middle - state.shared) * sigma**-2.0
+    information[range(TOLD), range(TOLD)] = sigma[:TOLD] ** -2.0
+    information[TOLD:SHARED, TOLD:SHARED] = _tilting(p, state)
+    side[:SHARED] = information[:SHARED, :SHARED] @ (middle - state.shared)
     for i in range(1, j):
         if not p.chained[i]:
             continue
@@ -325,6 +311,25 @@ def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
         information += np.outer(row, row) / _HOP**2
         side += row * off / _HOP**2
     return information, side
+
+
+def _tilting(p: _Problem, state: _State) -> Array:
+    """Information (9, 9) on what tilting seems to show beyond the field's own change.
+
+    Where the attitude errs by e, the field's response to tilts of variance m comes out wrong by the share e^2 / m, as
+    slopes over a noisy abscissa do (Fuller 1987, section 1.1), and at random by e / sqrt(m n) for n errors in turn.
+    """
+    variance, axes = np.linalg.eigh(p.tilts)
+    share = _TILT_ERR**2 / np.maximum(variance, 0.1 * _TILT_ERR**2)
+    field = state.shared[GAIN] * math.hypot(state.shared[LEVEL], state.shared[DOWNWARD])
+    sigma = field * np.sqrt(np.minimum(share**2 + share / p.blocks, 4.0))
+    return np.kron((axes * sigma**-2.0) @ axes.T, np.eye(3))
+
+
+def _turn_about_down(p: _Problem) -> float:
+    """Variance, rad^2, of a turn about the down axis: only tilting shows it, and tilts err."""
+    shown = max(0.5 * float(np.trace(p.tilts)) - _TILT_ERR**2, 0.05 * _TILT_ERR**2)
+    return _TILT_ERR**2 / (shown * p.blocks)
 
 
 def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | None = None) -> Fit:
@@ -345,7 +350,7 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
     if expected is not None:
         strength = float(np.median(np.hypot(level[:, 0], level[:, 1])))
         gain = min(max(strength / max(expected.horizontal_mg, 50.0), 0.4), 2.0)
-    state = _State(turn, shared, level, gain, p.late)
+    state = _State(turn, shared, level, gain, p.late, p.down)
     theta = state.theta(p.power_by)
     for _ in range(_STEPS):
         variance = max(p.misfit(theta) / (3.0 * p.n), _LEAST_MG**2)
@@ -368,9 +373,8 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
         if float(np.abs(step / np.sqrt(np.diag(covariance))).max()) < _DONE:
             break
     x = state.shared
-    plain_cov = covariance[TURN, TURN] + np.eye(3) * _TILT**2
-    covariance += _tilted(p, state, covariance / worth)
-    covariance[TURN, TURN] += np.eye(3) * _TILT**2
+    upright = state.turn @ (p.down / np.linalg.norm(p.down))
+    covariance[TURN, TURN] += np.eye(3) * _TILT**2 + _turn_about_down(p) * np.outer(upright, upright)
     return Fit(
         gain=float(x[GAIN]),
         soft=state.bend() - np.eye(3),
@@ -384,11 +388,10 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
         drift_rads=float(x[DRIFT]),
         step_b_mg=x[STEP],
         azimuth_rad=state.azimuth,
-        covariance=covariance[:SHARED, :SHARED],
+        covariance=covariance[:TOLD, :TOLD],
         rms_mg=math.sqrt(max(p.misfit(theta), 0.0) / (3.0 * p.n)),
         plain_mg=math.sqrt(max(plain, 0.0) / (3.0 * p.n)),
         samples=round(p.n),
-        plain_cov=plain_cov,
     )
 
 
