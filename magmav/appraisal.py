@@ -15,7 +15,7 @@ from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import ZERO3, Heading, Record, Shaping, State, Vec3, vec3
+from magmav.core.types import NO_SHAPING, ZERO3, Heading, Record, Shaping, State, Vec3, vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -59,8 +59,9 @@ class CompassLog:
 
     def add(self, record: Record, shaping: Shaping) -> None:
         """Append one record and what the autopilot did to its value after the offsets."""
-        motor = shaping.motor_b_mg
-        sensor = record.mag_b_mg + np.linalg.solve(shaping.matrix, motor) if motor.any() else record.mag_b_mg
+        sensor = record.mag_b_mg
+        if shaping is not NO_SHAPING:
+            sensor = sensor + np.linalg.solve(shaping.matrix, shaping.motor_b_mg)
         started = record.verdict.state is not State.NO_DATA
         magnetic, true = _angles(record.heading) if started else (math.nan, math.nan)
         stored_magnetic, stored_true = _angles(record.stored_heading)

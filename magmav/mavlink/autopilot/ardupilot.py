@@ -85,6 +85,7 @@ class Calibrations:
         self._ampere: float | None = None
         self._parts: dict[int, tuple[Vec3, Shaping]] = {}
         self._answers: dict[tuple[str, int], bool] = {}  # asked for every sample, changed by few messages
+        self._offsets: dict[int, Vec3 | None] = {}
 
     def param(self, r: ParamReading) -> tuple[int, ...]:
         """Take one parameter; the compasses whose correction it changed."""
@@ -134,6 +135,7 @@ class Calibrations:
     def _forget_answers(self) -> None:
         self._parts.clear()
         self._answers.clear()
+        self._offsets.clear()
 
     def _answer(self, question: str, compass: int, find: Callable[[int], bool]) -> bool:
         known = self._answers.get((question, compass))
@@ -179,8 +181,10 @@ class Calibrations:
 
     def offsets(self, compass: int) -> Vec3 | None:
         """Stored offsets, mG, or None."""
-        names = offset_names(compass)
-        return vec3([self._held[n] for n in names], "offsets") if all(n in self._held for n in names) else None
+        if compass not in self._offsets:
+            held = [self._held.get(n) for n in offset_names(compass)]
+            self._offsets[compass] = None if None in held else vec3(held, "offsets")
+        return self._offsets[compass]
 
     def stored(self, compass: int) -> dict[str, float]:
         """Every value heard for this compass, in the autopilot's own names and units."""
