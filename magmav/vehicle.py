@@ -56,7 +56,7 @@ from magmav.settings import Settings
 _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
 _SAY_FROZEN_NS = 1_000_000_000
 _DOUBTED_S = 5.0  # after a sudden change the answer is still on its way: the gyro holds the own yaw
-_STEERS_RAD = math.radians(20.0)  # a heading less sure than this does not move the own yaw
+_WRONG_RAD = math.radians(25.0)  # own yaw so far off is wrong: it is moved slowly and may have begun so
 _ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 
 
@@ -203,7 +203,7 @@ class Vehicle:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
-        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self._unflown())
+        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
         finding = self._doubted(finding, self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
@@ -260,14 +260,13 @@ class Vehicle:
 
         Own tilt and turning never hear of the compass, so nothing learnt with them confirms itself.
         """
-        sure = f.heading.valid and f.heading.sigma_rad < _STEERS_RAD
-        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not sure:
+        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not f.heading.valid:
             return f
         motion = self.assembler.motion
         if f.verdict.state is not State.REFUSED and f.estimate.changed_ago_s >= _DOUBTED_S:
             motion.field(f.corrected_b_mg, s.age_s + f.estimate.delay_s, f.heading.sigma_rad)
         yaw, was = motion.magnetic_yaw(s.boot_ns), f.heading
-        if yaw is None or abs(wrap_pi(yaw - was.magnetic_rad)) > 3.0 * _STEERS_RAD:  # it began wrong: let it be
+        if yaw is None or abs(wrap_pi(yaw - was.magnetic_rad)) > _WRONG_RAD:
             return f
         true = wrap_tau(was.true_rad + yaw - was.magnetic_rad) if was.true_valid else 0.0
         return replace(f, heading=replace(was, magnetic_rad=yaw, true_rad=true))
@@ -342,9 +341,6 @@ class Vehicle:
             unix_ns = self._unix_minus_boot_ns + self._now_ns()
         return self._keeper.at(*self._place, unix_ns)
 
-    def _unflown(self) -> bool:
-        return self.phase.flyer and self.phase.takeoff_ns is None
-
     def _circumstances(self, compass: int, here: ExpectedField | None) -> Circumstances:
         held = self.calibrations
         return Circumstances(
@@ -352,9 +348,9 @@ class Vehicle:
             relative=not held.known(compass),
             assumed=held.assumed(compass),
             parameters_changed=held.changed(compass),
-            grounded=self._unflown() and not self.settings.learn.on_ground,
+            grounded=self.phase.unflown and not self.settings.learn.on_ground,
             frozen_s=self.assembler.frozen_s(compass),
-            stored_b_mg=held.offsets(compass),
+            stored_b_mg=held.offsets(compass) if self.phase.flyer else None,
         )
 
     def _after_reboot(self) -> None:

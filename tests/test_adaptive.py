@@ -59,7 +59,7 @@ def block_of(seed, n=3):
         body = body_from_earth(*rng.uniform(-3, 3, 3))
         gathering.passes(0.07, body[:, 2], 1e-6)
         s = replace(first, shaping=shaping, rate_b_rads=vec3(rng.normal(0, 0.5, 3), "rate"))
-        gathering.add(s, rng.normal(0, 300, 3), body, float(rng.uniform(-0.5, 0.5)))
+        gathering.add(s, rng.normal(0, 300, 3), body, 0.01, float(rng.uniform(-0.5, 0.5)))
     return gathering.close()
 
 
@@ -123,7 +123,14 @@ def test_time_is_f_p_f_and_q():
 @pytest.mark.parametrize("readings", [1, 4])
 def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(readings):
     """Same model, same noise, no doubt and no adaptation: only the algebra is left."""
-    calm = Tuning(doubt_nis=1e12, adapt_after=10**9, change_chi2=1e12, prune_every=10**9, block_readings=readings)
+    calm = Tuning(
+        doubt_nis=1e12,
+        least_tilt_rad=0.0,
+        adapt_after=10**9,
+        change_chi2=1e12,
+        prune_every=10**9,
+        block_readings=readings,
+    )
     mine = AdaptiveEstimator(replace(calm, block_s=10.0))
     flight = placed(samples("figure eight", 5, seconds=12.0))
     bank = Bank.begun((HERE[0], calm.model_mg, HERE[1], calm.model_mg), calm)
@@ -138,7 +145,7 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(reading
         about_down = float(s.rate_b_rads @ body[:, 2]) * s.dt_s
         turn2 = calm.turn_walk_rad**2 * s.dt_s + (calm.turn_scale * about_down) ** 2
         gathering.passes(s.dt_s, body[:, 2], turn2)
-        gathering.add(s, s.mag_b_mg, body, 0.0)
+        gathering.add(s, s.mag_b_mg, body, 0.0, 0.0)
         mine.step(s)
         if i % readings:
             continue
@@ -149,7 +156,7 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(reading
         theirs.x, theirs.P = copy_of.x[0], copy_of.p[0]
         y, j, u = equation(copy_of.x, block)
         r = np.kron(np.ones((readings, readings)), calm.common_mg**2 * np.eye(3))
-        for m, one in enumerate(smear(u, block.rate_b_rads, calm.sync_s)[0]):
+        for m, one in enumerate(smear(u, block, calm.sync_s)[0]):
             r[3 * m : 3 * m + 3, 3 * m : 3 * m + 3] += one + calm.white_mg**2 * np.eye(3)
         rows, said = j[0].reshape(-1, at.SIZE).copy(), y[0].ravel().copy()
         theirs.update(block.z.ravel(), lambda _, j=rows: j, lambda _, y=said: y, R=r)

@@ -53,14 +53,14 @@ def test_thor_frozen_after_a_minute_keeps_its_heading_and_repeats_byte_for_byte(
     assert text == json.dumps(finite(here)) + "\n"
     (compass,) = here["vehicles"][0]["compasses"]
     heading = compass["heading"]
-    assert heading["rms_deg"] <= 5.0
+    assert heading["rms_deg"] <= 4.0
     assert heading["uncalibrated_rms_deg"] > 90.0
     assert heading["reference"] == "ATTITUDE yaw"
     assert heading["n"] > 10_000 and heading["from_s"] > 280.0
     assert compass["state"] == "READY"
     assert compass["axes"][:2] == ["OBSERVED", "OBSERVED"]
     # An attitude-aided fit of the whole flight, made by others (data/README.md).
-    assert np.abs(np.array(compass["hard_iron_mg"]) - (389, -162, 395)).max() < 15.0
+    assert np.abs(np.array(compass["offsets_mg"]) + (389, -162, 395)).max() < 25.0
     assert compass["device_id"] == 97539 and not compass["relative"]
 
 

@@ -147,15 +147,6 @@ def backwards(samples: Sequence[Sample]) -> list[Sample]:
 # ---------------------------------------------------------------- one way
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """One block: boot times of its ends, and the square of its innovation's mean, mG^2."""
-
-    from_ns: int
-    to_ns: int
-    square_mg2: float
-
-
 class _Watch(ChangeWatch):
     """May be deaf for a while."""
 
@@ -181,17 +172,18 @@ class _Pass(AdaptiveEstimator):
         self._alpha_rad = alpha_rad
         self._change: _Watch = _Watch(self.tuning)
         self._deaf = deaf
-        self.seen: list[_Seen] = []
-        self.changed: list[_Seen] = []  # the blocks at which a change was noticed
-        self._ends = (0, 0)
+        self.seen: dict[int, float] = {}  # square of the innovation by boot time, mG^2
+        self.ends_ns: tuple[int, int] = (0, 0)  # of the last block
+        self.changed: list[tuple[int, int]] = []  # ends of the blocks at which a change was noticed
+        self._times_ns: list[int] = []
 
     def _prior(self, s: Sample, z: Array, down_b: Array) -> tuple[float, float, float, float]:
         self.field = super()._prior(s, z, down_b)
         return self.field
 
     def _learn(self) -> None:
-        ends = [self._gathering._samples[i].boot_ns for i in (0, -1)]
-        self._ends = min(ends), max(ends)
+        self._times_ns = [s.boot_ns for s in self._gathering._samples]
+        self.ends_ns = min(self._times_ns), max(self._times_ns)
         if self._alpha_rad is not None and self._bank is not None and not self.seen:
             away = np.abs((self._bank.x[:, at.ALPHA] - self._alpha_rad + math.pi) % TAU - math.pi)
             self._bank.keep(np.flatnonzero(away < 1.51 * TAU / self.tuning.yaws))  # three directions
@@ -200,13 +192,13 @@ class _Pass(AdaptiveEstimator):
     def _update(self, bank: Bank, block: Block) -> None:
         best = int(np.argmax(bank.log_weight))
         foretold = equation(bank.x[best : best + 1], block)[0]
-        mean = (block.z - foretold[0])[:, : block.axes].mean(0)
-        self.seen.append(_Seen(*self._ends, float(mean @ mean)))
+        squares = ((block.z - foretold[0])[:, : block.axes] ** 2).sum(1)
+        self.seen |= zip(self._times_ns, squares.tolist(), strict=True)
         before_s = self._change.since_s
-        self._change.deaf = self._deaf[0] <= self._ends[0] <= self._deaf[1]
+        self._change.deaf = self._deaf[0] <= self.ends_ns[0] <= self._deaf[1]
         super()._update(bank, block)
         if self._change.since_s < before_s:
-            self.changed.append(self.seen[-1])
+            self.changed.append(self.ends_ns)
 
     @property
     def bank(self) -> Bank | None:
@@ -280,9 +272,9 @@ class _BothWays:
                 self._note()
                 one.let_go(told.pop(0)[1])
                 due_ns = 0
-            blocks = len(one.seen)
+            blocks = len(one.seen)  # grows with each block
             one.step(s)
-            if len(one.seen) > blocks and one.seen[-1].to_ns >= due_ns:
+            if len(one.seen) > blocks and one.ends_ns[1] >= due_ns:
                 due_ns = self._note() + _EVERY_NS
         if one.seen:
             self._note()
@@ -298,7 +290,7 @@ class _BothWays:
         one = self.forward
         if one.bank is None or not one.seen:
             return 0
-        at_ns = one.seen[-1].to_ns
+        at_ns = one.ends_ns[1]
         self.before.setdefault(at_ns, noted(one.bank))
         return at_ns
 
@@ -342,38 +334,40 @@ class _BothWays:
     def middle_ns(self) -> float:
         """Half of the flight is before it."""
         seen = self.forward.seen
-        return 0.5 * (seen[0].from_ns + seen[-1].to_ns) if seen else 0.0
+        return 0.5 * (min(seen) + max(seen)) if seen else 0.0
 
     @property
     def startled(self) -> bool:
         """Did a side believe in a change while it knew less than the other?"""
-        young = [c for c in self.forward.changed if c.to_ns < self.middle_ns]
-        return bool(young or [c for c in self.backward.changed if c.from_ns > self.middle_ns])
+        young = [to_ns for _, to_ns in self.forward.changed if to_ns < self.middle_ns]
+        return bool(young or [from_ns for from_ns, _ in self.backward.changed if from_ns > self.middle_ns])
 
     def _windows(self) -> list[tuple[int, int]]:
         """Where to look: between the backward and the forward notice of one change, or where the elder noticed one."""
-        alone = [c.from_ns for c in self.backward.changed]
+        alone = [from_ns for from_ns, _ in self.backward.changed]
         out = []
-        for c in self.forward.changed:
-            partner = max((t for t in alone if 0 <= c.to_ns - t <= 2 * _LATE_NS), default=None)
+        for _, to_ns in self.forward.changed:
+            partner = max((t for t in alone if 0 <= to_ns - t <= 2 * _LATE_NS), default=None)
             if partner is not None:
                 alone.remove(partner)
-                out.append((partner, c.to_ns))
-            elif c.to_ns > self.middle_ns:
-                out.append((c.to_ns - _LATE_NS, c.to_ns))
+                out.append((partner, to_ns))
+            elif to_ns > self.middle_ns:
+                out.append((to_ns - _LATE_NS, to_ns))
         return out + [(t, t + _LATE_NS) for t in alone if t < self.middle_ns]
 
     def _place(self, from_ns: int, to_ns: int) -> int | None:
-        """The end of the forward block after which the forward bank is surprised, and before which the backward one."""
-        fore = [b for b in self.forward.seen if b.from_ns >= from_ns and b.to_ns <= to_ns]
-        back = [b for b in self.backward.seen if b.from_ns >= from_ns and b.to_ns <= to_ns]
-        usual = [float(np.median([b.square_mg2 for b in one.seen])) + 1e-9 for one in (self.forward, self.backward)]
+        """The reading after which the forward bank is surprised, and before which the backward one."""
+        here = [
+            {t: square / usual for t, square in one.seen.items() if from_ns <= t <= to_ns}
+            for one in (self.forward, self.backward)
+            for usual in [float(np.median(list(one.seen.values()))) + 1e-9]
+        ]
+        fore, back = here
 
         def surprise(at_ns: int) -> float:
-            first = sum(b.square_mg2 for b in fore if b.to_ns <= at_ns) / usual[0]
-            return first + sum(b.square_mg2 for b in back if b.from_ns > at_ns) / usual[1]
+            return sum(v for t, v in fore.items() if t <= at_ns) + sum(v for t, v in back.items() if t > at_ns)
 
-        return min((b.to_ns for b in fore), key=surprise, default=None)
+        return min(fore, key=surprise, default=None)
 
     def _jump(self, at_ns: int) -> float | None:
         """How far the iron before is from the iron after, mG; None where they may be the same."""

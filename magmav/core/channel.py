@@ -27,7 +27,8 @@ from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample,
 
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
-_GUESS_RAD = math.radians(20.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
+_UPSET_S = 3.0  # after a sudden change no heading is published: its sigma is that of an answer on its way
+_GUESS_RAD = math.radians(22.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
 _FIELD_WEIGHT = 0.04  # five times a second: a memory of five seconds
 
@@ -42,7 +43,7 @@ class Circumstances:
     parameters_changed: bool
     grounded: bool
     frozen_s: float
-    stored_b_mg: Vec3 | None = None  # the offsets the autopilot holds, to be added
+    stored_b_mg: Vec3 | None = None  # the offsets a flying vehicle's autopilot holds, to be added
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +123,7 @@ class Channel:
         e = belief.estimate
         corrected = corrected_field(s, e, c.expected)
         now = UNKNOWN
-        if self._estimate is not None and belief.heading_sigma_rad < _GUESS_RAD:
+        if self._estimate is not None and belief.heading_sigma_rad < _GUESS_RAD and e.changed_ago_s > _UPSET_S:
             then = published(
                 s,
                 corrected,

@@ -94,7 +94,7 @@ def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
     if wrong:
         return Verdict(State.REFUSED, axes, wrong + missing + notes)
     if missing:
-        return Verdict(State.LEARNING, axes, missing + notes)
+        return Verdict(State.LEARNING, axes, tuple(dict.fromkeys(missing + notes)))
     return Verdict(State.READY, axes, notes)
 
 
@@ -135,8 +135,6 @@ def _missing(
     out += [n for n, axis in zip(names, axes, strict=False) if axis is AxisState.NOT_OBSERVED]
     if e.offsets_heading_sigma_rad > limits.heading_sigma_rad * slack or e.sectors < _HEADING_SECTORS:
         out.append(Reason.HEADING_UNSURE)
-    if e.left_mg > limits.heading_sigma_rad * slack * _horizontal(e, estimate):
-        out.append(Reason.Z_NOT_OBSERVED)
     if e.apart > _APART * slack:
         out.append(Reason.OPINIONS_DIFFER)
     if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS:
@@ -145,6 +143,8 @@ def _missing(
         out.append(Reason.STILL_MOVING)
     if e.relative:
         out.append(Reason.RELATIVE_ONLY)
+    if not out and e.left_mg > limits.heading_sigma_rad * slack * _horizontal(e, estimate):
+        out.append(Reason.Z_NOT_OBSERVED)
     return tuple(out)
 
 

@@ -169,6 +169,11 @@ class Phase:
         """Of the last flight; an earlier crash was mended and flown again."""
         return self.flights[-1].crash_ns if self.flights else None
 
+    @property
+    def unflown(self) -> bool:
+        """A vehicle that flies and has not yet."""
+        return self.flyer and self.takeoff_ns is None
+
     def learnable(self, boot_ns: int, on_ground: bool) -> bool:
         """Does time at this boot time teach? ``on_ground`` is the operator saying that it always does."""
         aloft = self.aloft(boot_ns)

@@ -99,7 +99,7 @@ class AdaptiveEstimator:
         if self._model_mg is None and s.model_mg is not None:
             self._model_mg = s.model_mg
             self._bank.tell_field(*s.model_mg, n)
-        gathering.add(s, z, body_from_own, drive)
+        gathering.add(s, z, *self._tilting.calmed(body_from_own, n.least_tilt_rad), drive)
         if len(gathering) == n.block_readings or gathering.span_s + dt > n.block_s:
             self._learn()
 
@@ -148,7 +148,7 @@ class AdaptiveEstimator:
         apart = expected.reshape(count, size, k, size, k)
         np.einsum("kiaja->kija", apart)[...] += bank.common_mg2[:, None, None, None]
         own = np.einsum("kiaib->kiab", apart)
-        own += smear(u, block.rate_b_rads, n.sync_s)[..., :k, :k]
+        own += smear(u, block, n.sync_s)[..., :k, :k]
         np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
         strange = doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)

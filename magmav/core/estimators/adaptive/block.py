@@ -22,6 +22,7 @@ class Block:
 
     z (n, 3) : A m + e.  north_b, east_b, down_b (n, 3) : the own frame's axes.  rate_b_rads (n, 3).
     crosses (n, 6, 3) : cross matrices of the vehicle's tilt and of its rate.  drive (n,) : throttle - 1/2.
+    calmed_rad (n,) : tilt taken out of the attitude, where it may be noise.
     ahead_s (n, 3) : integral of down_b from the sample to the block's end.
     dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
     """
@@ -32,6 +33,7 @@ class Block:
     down_b: Array
     rate_b_rads: Array
     crosses: Array
+    calmed_rad: Array
     drive: Array
     ahead_s: Array
     dt_s: float
@@ -52,6 +54,7 @@ class Gathering:
         self._samples: list[Sample] = []
         self._bodies: list[Array] = []
         self._z: list[Array] = []
+        self._calmed: list[float] = []
         self._drives: list[float] = []
         self._downs: list[Array] = []  # integral of down_b up to each sample
         self._dt_s = 0.0
@@ -80,13 +83,14 @@ class Gathering:
         self._down_s = self._down_s + dt_s * down_b
         self._turn_rad2 += turn_rad2
 
-    def add(self, s: Sample, z: Array, body_from_own: Array, drive: float) -> None:
-        """Take one sample."""
+    def add(self, s: Sample, z: Array, body_from_own: Array, calmed_rad: float, drive: float) -> None:
+        """Take one sample. calmed_rad : tilt that was taken out of its attitude."""
         if not self._samples:
             self._first_s = self._dt_s
         self._samples.append(s)
         self._z.append(z)
         self._bodies.append(body_from_own)
+        self._calmed.append(calmed_rad)
         self._drives.append(drive)
         self._downs.append(self._down_s)
 
@@ -108,6 +112,7 @@ class Gathering:
             down_b=down_b,
             rate_b_rads=rates,
             crosses=crosses,
+            calmed_rad=np.array(self._calmed),
             drive=np.array(self._drives),
             ahead_s=self._down_s - np.array(self._downs),
             dt_s=self._dt_s,

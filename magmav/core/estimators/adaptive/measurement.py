@@ -71,9 +71,9 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     return y, j, u
 
 
-def smear(u: Array, rate_b_rads: Array, sync_s: float) -> Array:
-    """(K, n, 3, 3) mG^2: what a mismatch in time does to a turning field; it never changes the field's length."""
-    share = sync_s**2 * (rate_b_rads * rate_b_rads).sum(1)
+def smear(u: Array, block: Block, sync_s: float) -> Array:
+    """(K, n, 3, 3) mG^2: what a mismatch in time or tilt does to the field; it never changes the field's length."""
+    share = sync_s**2 * (block.rate_b_rads * block.rate_b_rads).sum(1) + block.calmed_rad**2
     out: Array = (-share[:, None, None] * u[..., :, None]) * u[..., None, :]
     diagonal = out.reshape(*out.shape[:2], 9)[..., ::4]
     diagonal += (share * (u * u).sum(2))[..., None]

@@ -14,10 +14,11 @@ import numpy as np
 from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
+from magmav.core.rotation import rotation
 
 _WILD_MG, _WILD_MG_PER_RAD = 50.0, 330.0
 _WILD_OF = 5
-_TILTS = 3000  # readings remembered
+_TILTS, _TILTS_LEAST = 3000, 100  # readings remembered, and wanted before anything is made of them
 _MEDIAN_TO_VARIANCE = 2.2  # variance of a normal value over the squared median of its size
 
 
@@ -50,6 +51,18 @@ class Tilting:
     def __init__(self) -> None:
         self._n = 0
         self._x = self._y = self._square = 0.0
+
+    def calmed(self, body_from_own: Array, least_rad: float) -> tuple[Array, float]:
+        """The attitude with the tilt at its mean where it may be nothing but noise, and by how much it was off, rad."""
+        if self.rms_rad >= least_rad or self._n < _TILTS_LEAST:
+            return body_from_own, 0.0
+        x, y, z = body_from_own[:, 2].tolist()
+        # A small turn of the body takes down to its mean, if that is near at all.
+        wx, wy = (y - self._y) * math.copysign(1.0, z), (self._x - x) * math.copysign(1.0, z)
+        off = math.hypot(wx, wy)
+        if off > 3.0 * least_rad:
+            return body_from_own, 0.0
+        return rotation(np.array((wx, wy, 0.0))) @ body_from_own, off
 
     def step(self, down_b: Array) -> None:
         """Take where down is, (3,)."""

@@ -50,7 +50,7 @@ class Tuning:
     sync_s: float = 0.02
     tilt_rad: float = math.radians(1.0)
     tilt_tau_s: float = 15.0
-    least_tilt_rad: float = math.radians(1.5)  # RMS per axis: less may be nothing but noise of the attitude
+    least_tilt_rad: float = math.radians(1.2)  # RMS per axis: less may be nothing but noise of the attitude
     own_tilt_rad: float = math.radians(5.0)  # of gyro and accelerometer alone, misled by every acceleration
     own_tilt_tau_s: float = 6.0
     disturbance_mg: float = 1.5
