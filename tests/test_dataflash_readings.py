@@ -345,7 +345,9 @@ def test_a_real_flight_teaches_the_compass_that_was_never_calibrated() -> None:
         pytest.skip(f"real recordings not found at {LOGS}; set MAGMAV_DATA")
     recording = DataflashRecording(path)
     # The others' fit is one of offsets alone, as kalman's is; adaptive also finds soft iron and what the motors do.
-    pipeline = Pipeline(with_value(Settings(), "learn", "estimator", "kalman"), world_magnetic_model, recording.unix_offset_ns)
+    pipeline = Pipeline(
+        with_value(Settings(), "learn", "estimator", "kalman"), world_magnetic_model, recording.unix_offset_ns
+    )
     records: list[Record] = []
     yaw: list[tuple[float, float]] = []
     compasses = set()

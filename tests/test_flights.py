@@ -60,7 +60,7 @@ def test_thor_frozen_after_a_minute_keeps_its_heading_and_repeats_byte_for_byte(
     assert compass["state"] == "READY"
     assert compass["axes"][:2] == ["OBSERVED", "OBSERVED"]
     # An attitude-aided fit of the whole flight, made by others (data/README.md).
-    assert np.abs(np.array(compass["offsets_mg"]) + (389, -162, 395)).max() < 25.0
+    assert np.abs(-np.array(compass["offsets_mg"]) - (389, -162, 395)).max() < 25.0
     assert compass["device_id"] == 97539 and not compass["relative"]
 
 

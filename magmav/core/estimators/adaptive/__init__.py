@@ -59,6 +59,7 @@ class AdaptiveEstimator:
         self._residual_n = 0
         self._nis = 1.0
         self._axes = 3
+        self._own_tilt = False
         self._matrix: Array = _EYE3
         self._model_mg: tuple[float, float] | None = None
 
@@ -139,7 +140,7 @@ class AdaptiveEstimator:
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
-        self._axes, self._matrix = k, block.shaping.matrix
+        self._axes, self._matrix, self._own_tilt = k, block.shaping.matrix, block.own_tilt
         y, j, u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
@@ -187,6 +188,8 @@ class AdaptiveEstimator:
         if self._bank is None or self._samples < 10:
             return None
         mean, covariance = self._bank.mixture()
+        if self._own_tilt:
+            covariance = covariance * self.tuning.own_tilt_doubt**2
         soft = _EYE3 + soft_matrix(mean[at.S])
         take = np.zeros((3, at.SIZE))  # iron at mean throttle
         take[:, at.B], take[:, at.K] = _EYE3, self._drive * np.linalg.inv(self._matrix)
