@@ -66,7 +66,7 @@ def test_every_estimator_of_the_project_has_a_row(compared):
 def test_the_answer_is_the_one_the_pipeline_gives(compared):
     """Bit for bit: comparing is not another way of estimating."""
     records = Bench().play(flight(seconds=60.0))
-    got = rows(compared)["kalman"]
+    got = rows(compared)[Settings().learn.estimator]
     last = replay(told(flight(seconds=60.0)), Settings(), earth_model)["vehicles"][0]["compasses"][0]
     assert got["offsets_mg"] == pytest.approx(last["offsets_mg"], abs=0.5)  # replay's is up to 0.2 s older
     assert got["state"] == records[-1].verdict.state.name

@@ -25,7 +25,7 @@ from magmav.core.types import (
 from magmav.geomag import world_magnetic_model
 from magmav.pipeline import Pipeline
 from magmav.recording import open_recording
-from magmav.settings import Settings
+from magmav.settings import Settings, with_value
 
 KINDS = ("tlog", "bin", "ulg")
 CUT_S = 90.0
@@ -55,7 +55,10 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> Answers:
 def learnt(path: Path) -> Record:
     """The last Record, from the pipeline that flies."""
     recording = open_recording(path)
-    pipeline = Pipeline(Settings(), world_magnetic_model, recording.unix_offset_ns)
+    # The readers are judged: kalman, which knows the down axis of this flight whatever the rate of the samples.
+    pipeline = Pipeline(
+        with_value(Settings(), "learn", "estimator", "kalman"), world_magnetic_model, recording.unix_offset_ns
+    )
     records = [pipeline.step(reading, t_ns) for t_ns, reading in recording.readings()]
     return next(record for record in reversed(records) if record is not None)
 
