@@ -23,7 +23,7 @@ from process_rig import started
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.cli import main
-from magmav.core.types import Reason, State
+from magmav.core.types import AxisState, Reason, State
 from magmav.geomag import world_magnetic_model
 from magmav.link.udp import udp_in
 from magmav.live import Session
@@ -222,7 +222,10 @@ def test_reboot_in_flight_is_counted_and_everything_is_read_again(flight):
     assert f.service.counts()["vehicle 1"]["reboots"] == 1
     assert f.companion.presence.boots == 1
     assert State.READY not in states(f, 1, 42.0, 50.0)  # what was learnt before is not carried over
-    assert ready(f.last()) and within_claim(f)
+    # The level axes are known again; the down axis, 240 mG off as stored, is not yet: offsets without it would mislead.
+    verdict = f.last().verdict
+    assert verdict.axes[:2] == (AxisState.OBSERVED,) * 2 and within_claim(f)
+    assert ready(f.last()) or verdict.reasons == (Reason.Z_NOT_OBSERVED,)
 
 
 def test_a_third_lost_the_rest_doubled_and_out_of_order_costs_no_truth(flight):
