@@ -4,7 +4,7 @@
     python benchmarks/causes.py --flights 10 --fault all    each fault: found, and what else was named
 
 A flight has a pattern, a site, wind, iron and noise drawn from its seed, two compasses, and the fault (on compass 1).
-The pipeline is the service's own, with its default estimator.
+The pipeline is the service's own, with its default estimator unless another is asked for.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from magmav_sim import Simulation, parse_scenario
 from magmav_sim.link import SimulatedLink
 
+from magmav.core.estimators import ESTIMATORS
 from magmav.geomag import world_magnetic_model
 from magmav.live import Session
 from magmav.settings import Settings, with_value
@@ -98,7 +99,7 @@ def scenario(seed: int, fault: str) -> tuple[str, str]:
     return "\n".join(parts), name
 
 
-def fly(fault: str, seed: int) -> dict[str, object]:
+def fly(fault: str, estimator: str, seed: int) -> dict[str, object]:
     """One flight: what was named of each compass at its end, and the gyro's true bias."""
     text, name = scenario(seed, fault)
     flown = parse_scenario(text.encode(), f"{fault}-{seed}.toml")
@@ -108,7 +109,7 @@ def fly(fault: str, seed: int) -> dict[str, object]:
             break
         simulation = Simulation(flown, seed + 10_000 * other)
     link = SimulatedLink(simulation)
-    settings = with_value(Settings(), "wire", "imu_hz", 10.0)
+    settings = with_value(with_value(Settings(), "wire", "imu_hz", 10.0), "learn", "estimator", estimator)
     with tempfile.TemporaryDirectory() as folder, Store(Path(folder) / "s.sqlite") as store:
         session = Session.on(link, settings, world_magnetic_model, store)
         session.service.run()
@@ -124,6 +125,7 @@ def main() -> int:
     ask.add_argument("--flights", type=int, default=10, help="flights per fault")
     ask.add_argument("--fault", default="none", choices=(*FAULTS, "all"))
     ask.add_argument("--seed", type=int, default=1000, help="of the first flight")
+    ask.add_argument("--estimator", default=Settings().learn.estimator, choices=tuple(ESTIMATORS))
     ask.add_argument("--jobs", type=int, default=2)
     ask.add_argument("--json", action="store_true", help="one line per flight, too")
     o = ask.parse_args()
@@ -134,7 +136,7 @@ def main() -> int:
             found = wrong = 0
             others: Counter[str] = Counter()
             expected = FAULTS[fault][0]
-            for got in pool.map(partial(fly, fault), range(o.seed, o.seed + o.flights)):
+            for got in pool.map(partial(fly, fault, o.estimator), range(o.seed, o.seed + o.flights)):
                 if o.json:
                     print(json.dumps(got), file=sys.stderr, flush=True)
                 codes = {c: {x["code"] for x in named} for c, named in got["named"].items()}  # type: ignore[attr-defined]

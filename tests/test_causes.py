@@ -135,6 +135,7 @@ def test_derivatives_agree_with_finite_differences():
         assert by[which, p] == pytest.approx(numeric[which], rel=1e-4, abs=1e-3)
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
 def test_a_turn_is_the_same_there_and_back(vector):
     matrix = turn_by(np.array(vector))
