@@ -382,13 +382,11 @@ def _books() -> dict[int, StoredCalibrations]:
 
 
 def new_channel(settings: Settings, name: str | None = None, make: Callable[[], Estimator] | None = None) -> Channel:
-    """One compass's channel. The adaptive estimator has a second opinion.
+    """One compass's channel.
 
     name : of the estimator, instead of that in the settings.  make : makes it, instead of ESTIMATORS.
     """
-    name = name or settings.learn.estimator
-    second = ESTIMATORS["twostep"] if name == "adaptive" else None
-    return Channel(make or ESTIMATORS[name], limits(settings), settings.gate.steady_s, second)
+    return Channel(make or ESTIMATORS[name or settings.learn.estimator], limits(settings), settings.gate.steady_s)
 
 
 def limits(settings: Settings) -> gate.Limits:

@@ -168,7 +168,7 @@ class _Pass(AdaptiveEstimator):
     """
 
     def __init__(self, tuning: Tuning | None, deaf: tuple[float, float], alpha_rad: float | None = None) -> None:
-        super().__init__(tuning)
+        super().__init__(tuning, second=False)
         self._alpha_rad = alpha_rad
         self._change: _Watch = _Watch(self.tuning)
         self._deaf = deaf
@@ -223,10 +223,10 @@ class _Pass(AdaptiveEstimator):
         if self._bank is None or s.body_from_own is None:
             return None
         n, waiting = self.tuning, self._gathering
-        own = s.tilt_from != "ATTITUDE"
+        own_rad = None if s.tilt_from == "ATTITUDE" else s.own_tilt_rad
         bank, down_b = noted(self._bank), s.body_from_own[:, 2]
-        turn_rad2 = waiting._turn_rad2 + ((4.0 if own else 1.0) * n.turn_walk_rad) ** 2 * s.dt_s
-        advance(bank, waiting._dt_s + s.dt_s, waiting._down_s + s.dt_s * down_b, turn_rad2, own, n)
+        turn_rad2 = waiting._turn_rad2 + ((1.0 if own_rad is None else 4.0) * n.turn_walk_rad) ** 2 * s.dt_s
+        advance(bank, waiting._dt_s + s.dt_s, waiting._down_s + s.dt_s * down_b, turn_rad2, own_rad, n)
         return bank, not (s.gap or self._lost)
 
     def says(self, bank: Bank) -> Estimate | None:

@@ -200,6 +200,7 @@ class Assembler:
             age_s=age_s,
             gap=gap,
             tilt_from=state.source,
+            own_tilt_rad=state.own_tilt_rad,
             learn=learn,
             axes=axes,
             model_mg=model_mg,

@@ -19,14 +19,13 @@ from magmav.core.correction import (
     stored_heading,
     turned_on,
 )
-from magmav.core.estimators import Estimator, disagreement
+from magmav.core.estimators import Estimator
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
 from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
-_OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone
 _UPSET_S = 3.0  # after a sudden change no heading is published: its sigma is that of an answer on its way
 _GUESS_RAD = math.radians(22.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
@@ -84,10 +83,8 @@ class Channel:
         make: Callable[[], Estimator],
         limits: gate.Limits,
         steady_s: float,
-        second: Callable[[], Estimator] | None = None,
     ) -> None:
         self._make = make
-        self._make_second = second
         self.limits = limits
         self._steady_s = steady_s
         self.held = False
@@ -107,8 +104,6 @@ class Channel:
         """Begin again: what was learnt belongs to another stretch of data."""
         self.verdict = gate.NOTHING
         self._estimator = self._make()
-        self._second = None if self._make_second is None else self._make_second()
-        self._apart = 0.0  # sigmas between the two opinions
         self._tilt2 = 0.0  # mean square of sin(tilt) where it was learnt
         self._excitation = Excitation()
         self._estimate: Estimate | None = None
@@ -152,8 +147,6 @@ class Channel:
         else:
             s = self._after_hold(s)
             self._estimator.step(s)
-            if self._second is not None:
-                self._second.step(s)
         belief = self._belief
         if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
             belief = self._believe(s, c)
@@ -169,7 +162,7 @@ class Channel:
         sigma = gate.floored(e)
         horizontal, down = field_of(e, c.expected)
         covariance = covariance_of_field(s, e)
-        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else _OWN_TILT_SIGMA_RAD
+        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else s.own_tilt_rad
         self._belief = _Belief(
             s.boot_ns,
             e,
@@ -197,8 +190,6 @@ class Channel:
         self._field_mg += weight * (field_mg - self._field_mg)
         upright = math.cos(s.roll_rad) * math.cos(s.pitch_rad)
         self._tilt2 += weight * (1.0 - upright * upright - self._tilt2)
-        second = None if self._second is None else self._second.estimate(expected)
-        self._apart = 0.0 if second is None else disagreement(e, second)
         level_mg = math.hypot(*level_field(corrected, s.roll_rad, s.pitch_rad))
         self._level_mg += weight * (level_mg - self._level_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
@@ -231,7 +222,6 @@ class Channel:
             offsets_heading_sigma_rad=offsets_sd,
             field_mg=self._field_mg,
             level_mg=self._level_mg,
-            apart=self._apart,
             left_mg=self._left(e, c, sigma_mg),
             steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
             sectors=self._excitation.sectors,

@@ -19,6 +19,7 @@ import numpy as np
 from magmav.core import marg
 from magmav.core.marg import Array, Quaternion
 from magmav.core.rotation import body_from_earth, euler_from_quaternion, tilt_from_force, wrap_pi, wrap_tau
+from magmav.core.tilt_doubt import TiltDoubt
 from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Vec3, vec3
 
 Solver = Literal["gn", "gd"]
@@ -45,6 +46,7 @@ class Carried(NamedTuple):
     yaw_rad: float
     rate_b_rads: Vec3
     epoch: int  # odd; yaws compare only within one epoch
+    tilt_sigma_rad: float  # about each level axis
 
 
 class _Rest:
@@ -103,6 +105,7 @@ class MargAttitude:
         self._north_rad: float | None = None  # azimuth of magnetic north in those own axes
         self._field_ns = 0
         self._field_s = 0.0  # since the yaw was first known
+        self._doubt = TiltDoubt(_TILT_TAU_S, 0.0)
 
     def seed(self, a: AttitudeReading) -> None:
         """Start from the autopilot's tilt, should its attitudes end here."""
@@ -168,7 +171,7 @@ class MargAttitude:
             return None
         roll, pitch, yaw = euler_from_quaternion(*q.tolist()) or (0.0, 0.0, 0.0)
         yaw = self._yaw_rad + wrap_pi(yaw - self._own_yaw(self._q))
-        return Carried(roll, pitch, yaw, self.rate_b_rads, self._epoch)
+        return Carried(roll, pitch, yaw, self.rate_b_rads, self._epoch, self._doubt.sigma_rad)
 
     def magnetic_yaw(self, boot_ns: int) -> float | None:
         """Yaw from magnetic north, rad in [0, 2 pi), at a boot time within 0.2 s of the last reading.
@@ -224,6 +227,7 @@ class MargAttitude:
         down_b = -(marg.matrix(self._q).T @ self._force_n) / strength
         trust = math.exp(-(((strength / _G - 1.0) / _WIDTH) ** 2))
         E = _DOWN_N + self._force_n / strength
+        self._doubt.step((trust * float(E[0]), trust * float(E[1])), self.rate_b_rads, dt)
         turn = self._turn(self._q, marg.row_jacobian(self._q, down_b), E, trust * (1.0 - math.exp(-dt / _TILT_TAU_S)))
         turn[2] = 0.0
         back = marg.turned(turn)

@@ -21,6 +21,7 @@ from magmav.core.rotation import (
     tilt_from_force,
     wrap_pi,
 )
+from magmav.core.tilt_doubt import TiltDoubt
 from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Mat3, Vec3
 
 _FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
@@ -45,6 +46,7 @@ class MotionState(NamedTuple):
     epoch: int
     bridged: bool  # the yaw step over a long gap is still good
     own_frame: Frame  # level with the earth, carried along by the gyro; good at every attitude
+    own_tilt_rad: float = 0.0  # sigma about each level axis of a tilt that is OWN
 
     @property
     def body_from_own(self) -> Mat3:
@@ -156,7 +158,17 @@ class Motion:
         if own is None:
             return None
         frame = of_attitude(own.roll_rad, own.pitch_rad, own.yaw_rad)
-        return MotionState(own.roll_rad, own.pitch_rad, own.yaw_rad, own.rate_b_rads, "OWN", own.epoch, False, frame)
+        return MotionState(
+            own.roll_rad,
+            own.pitch_rad,
+            own.yaw_rad,
+            own.rate_b_rads,
+            "OWN",
+            own.epoch,
+            False,
+            frame,
+            own.tilt_sigma_rad,
+        )
 
 
 class _OwnTilt:
@@ -169,6 +181,7 @@ class _OwnTilt:
         self.rate_b_rads: Vec3 = ZERO3
         self._yaw_rad = 0.0
         self._epoch = 1
+        self._doubt = TiltDoubt(_TILT_TAU_S, 0.03)
 
     def seed(self, a: AttitudeReading) -> None:
         """Start from the autopilot's tilt, should its attitudes end here."""
@@ -196,6 +209,8 @@ class _OwnTilt:
             x, y, z = 0.5 * (self.rate_b_rads + r.rate_b_rads) * dt
             moved = self._down_b - cross_matrix(x, y, z) @ self._down_b
             trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
+            pull = matrix(of_attitude(roll, pitch, self._yaw_rad)).T @ (trust * (down - moved))
+            self._doubt.step((float(pull[0]), float(pull[1])), self.rate_b_rads, dt)
             moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
             self._down_b = moved / np.linalg.norm(moved)
         self._boot_ns, self.rate_b_rads = r.boot_ns, r.rate_b_rads
@@ -211,4 +226,4 @@ class _OwnTilt:
         roll, pitch = self._tilt()
         dr, dp, dy = euler_rates(roll, pitch, self.rate_b_rads)
         yaw = self._yaw_rad + dy * age
-        return Carried(roll + dr * age, pitch + dp * age, yaw, self.rate_b_rads, self._epoch)
+        return Carried(roll + dr * age, pitch + dp * age, yaw, self.rate_b_rads, self._epoch, self._doubt.sigma_rad)

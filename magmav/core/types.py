@@ -249,6 +249,7 @@ class Sample:
     model_mg: tuple[float, float] | None = None  # the world model's field here, horizontal and down; None: no position
     body_from_own: Mat3 | None = None  # from a frame level with the earth that the gyro carries along; None: make it
     throttle: float | None = None  # share of full, 0 to 1; None where nobody says
+    own_tilt_rad: float = math.radians(5.0)  # sigma of the tilt, about each level axis, where it is OWN
     by_hand: bool = False  # taught while disarmed, of a vehicle that flies: turned in somebody's hands
 
 
@@ -280,6 +281,7 @@ class Estimate:
     throttle_mean: float = 0.0  # the throttle at which hard_iron_b_mg holds
     # no sigma is published under this: a real flight (thor75) missed its batch fit by 12 to 19 mG in z
     floor_mg: tuple[float, float, float] = (1.5, 1.5, 5.5)
+    apart: float = 0.0  # sigmas between this and a second opinion, in the direction in which they are most
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,13 +76,6 @@ def fitted(method: str, order: str = "body", forget: float = 1.0) -> Estimator:
     return FitEstimator(BodyOrder() if order == "body" else LevelOrder(), fitter, method not in ("minmax", "sytnyk"))
 
 
-def disagreement(a: Estimate, b: Estimate) -> float:
-    """By how many sigmas a second opinion, b, is away from a, in the direction in which it is most."""
-    from magmav.core.estimators.twostep import disagreement as apart
-
-    return apart(a, b)
-
-
 def _kalman() -> Estimator:
     from magmav.core.estimators.kalman import KalmanEstimator
 

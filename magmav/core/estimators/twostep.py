@@ -213,6 +213,11 @@ class TwostepEstimator:
         self._seen += 1
         self._down = self._down + (np.outer(down, point) - self._down) / min(self._seen, 60)
 
+    @property
+    def reaches_back_s(self) -> float:
+        """Age of the oldest value that the answer rests on."""
+        return self._now_s - self._begun_s
+
     # ------------------------------------------------------------ answer
 
     def estimate(self, expected: ExpectedField | None) -> Estimate | None:
@@ -277,23 +282,19 @@ class TwostepEstimator:
         return np.outer(u, u) * size2
 
 
-def disagreement(a: Estimate, b: Estimate, knows_mg: float = 60.0) -> float:
-    """By how many sigmas two opinions on one compass are apart, in the direction in which it is most; 0 where unsaid.
+def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = 60.0) -> float:
+    """By how many sigmas two opinions on one iron are apart, in the direction in which it is most.
 
-    Only directions count in which ``b``, the second opinion, knows the hard iron to ``knows_mg`` (one sigma) or better;
-    where it knows nothing it cannot contradict. That is the Mahalanobis distance with both covariances added, within
-    those directions. Both learnt from the same values, so their errors are alike and truly differ by less: the sum
-    overstates what the difference may be, and a distance is never claimed too large for that reason. Of two honest
-    opinions with errors of their own, three directions give 3.4 or more in one case of a hundred.
+    apart_mg (n,) : their difference.  a_mg2, b_mg2 (n, n) : their covariances, b's that of the second opinion.
+    Only directions count in which the second knows the hard iron to ``knows_mg`` (one sigma) or better; where it knows
+    nothing it cannot contradict. That is the Mahalanobis distance with both covariances added, within those
+    directions. Both learnt from the same values, so their errors are alike and truly differ by less: the sum overstates
+    what the difference may be, and a distance is never claimed too large for that reason. Of two honest opinions with
+    errors of their own, three directions give 3.4 or more in one case of a hundred.
     """
-    apart = a.hard_iron_b_mg - b.hard_iron_b_mg
-    said = [i for i in range(3) if a.says_b[i] and b.says_b[i]]
-    if not said:
-        return 0.0
-    variances, ways = np.linalg.eigh(b.covariance_mg2[np.ix_(said, said)])
+    variances, ways = np.linalg.eigh(b_mg2)
     ways = ways[:, variances <= knows_mg**2]
     if ways.shape[1] == 0:
         return 0.0
-    both = ways.T @ (a.covariance_mg2 + b.covariance_mg2)[np.ix_(said, said)] @ ways
-    off = ways.T @ apart[said]
-    return math.sqrt(max(float(off @ np.linalg.solve(both, off)), 0.0))
+    off = ways.T @ apart_mg
+    return math.sqrt(max(float(off @ np.linalg.solve(ways.T @ (a_mg2 + b_mg2) @ ways, off)), 0.0))

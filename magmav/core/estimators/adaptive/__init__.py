@@ -7,6 +7,7 @@ measurement  the one equation and its Jacobian
 bank         hypotheses and weights
 robust       wild readings, doubt, and noise as it shows
 change       a sudden change of the iron
+opinion      what the field's length alone says, joined to it
 tuning       every chosen number
 """
 
@@ -22,9 +23,11 @@ from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
+from magmav.core.estimators.adaptive.opinion import doubt, heard, joined, own_covariance
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
 from magmav.core.types import Estimate, Sample, mat3, vec3
@@ -42,13 +45,15 @@ _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 class AdaptiveEstimator:
     """One compass's bank."""
 
-    def __init__(self, tuning: Tuning | None = None) -> None:
+    def __init__(self, tuning: Tuning | None = None, second: bool = True) -> None:
+        """second : is a second opinion heard as well?"""
         self.tuning = tuning or Tuning()
         self._bank: Bank | None = None
         self._gathering = Gathering()
         self._wild = WildGate()
         self._tilting = Tilting()
         self._change = ChangeWatch(self.tuning)
+        self._second = TwostepEstimator() if second else None
         self._own_yaw_rad = 0.0
         self._lost = False
         self._by_hand = False
@@ -68,6 +73,10 @@ class AdaptiveEstimator:
     def step(self, s: Sample) -> None:
         """Learn from one sample, or carry time forward."""
         n, gathering = self.tuning, self._gathering
+        if self._by_hand and s.learn and not s.by_hand and self._second is not None:
+            self._second = TwostepEstimator()  # what stood about it in the hand does not fly along
+        if self._second is not None:
+            self._second.step(s)
         if len(gathering) and (s.gap or not s.learn or not gathering.fits(s)):
             self._learn()
         self._own_yaw_rad += s.yaw_step_rad
@@ -132,7 +141,7 @@ class AdaptiveEstimator:
             bank.lose_heading(n)
             self._lost = False
         if block.dt_s > 0.0 and self._blocks:
-            advance(bank, block.dt_s, block.down_s, block.turn_rad2, block.own_tilt, n)
+            advance(bank, block.dt_s, block.down_s, block.turn_rad2, block.own_tilt_rad, n)
         self._update(bank, block)
         self._blocks += 1
         if self._blocks % n.prune_every == 0 and len(bank) > len(MODELS):
@@ -140,7 +149,7 @@ class AdaptiveEstimator:
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
-        self._axes, self._matrix, self._own_tilt = k, block.shaping.matrix, block.own_tilt
+        self._axes, self._matrix, self._own_tilt = k, block.shaping.matrix, block.own_tilt_rad is not None
         y, j, u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
@@ -188,9 +197,6 @@ class AdaptiveEstimator:
         if self._bank is None or self._samples < 10:
             return None
         mean, covariance = self._bank.mixture()
-        if self._own_tilt:
-            covariance = covariance * self.tuning.own_tilt_doubt**2
-        soft = _EYE3 + soft_matrix(mean[at.S])
         take = np.zeros((3, at.SIZE))  # iron at mean throttle
         take[:, at.B], take[:, at.K] = _EYE3, self._drive * np.linalg.inv(self._matrix)
         own = covariance
@@ -201,10 +207,12 @@ class AdaptiveEstimator:
             unknown[at.B, at.B] = _DOWN * self.tuning.blind_v_mg**2
             own = own + unknown
             covariance = covariance if self._model_mg is not None else covariance + unknown
+        mean, iron_mg2, own_mg2, apart = self._joined(mean, covariance, own, take, expected)
+        soft = _EYE3 + soft_matrix(mean[at.S])
         return Estimate(
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
-            covariance_mg2=take @ covariance @ take.T,
-            own_sigma_mg=vec3(np.sqrt(np.diag(take @ own @ take.T)), "sigma"),
+            covariance_mg2=iron_mg2,
+            own_sigma_mg=vec3(np.sqrt(np.diag(own_mg2)), "sigma"),
             horizontal_mg=float(mean[at.H]),
             down_mg=float(mean[at.V]),
             residual_mg=math.sqrt(self._residual_mg2),
@@ -217,7 +225,27 @@ class AdaptiveEstimator:
             throttle_b_mg=vec3(mean[at.K], "throttle"),
             throttle_mean=self._drive + 0.5,
             floor_mg=_FLOOR_MG,
+            apart=apart,
         )
+
+    def _joined(
+        self, mean: Array, covariance: Array, own: Array, take: Array, expected: ExpectedField | None
+    ) -> tuple[Array, Array, Array, float]:
+        """State with the second opinion, covariance of the iron and that without the model, and sigmas between both."""
+        bank_mg2, own_mg2 = take @ covariance @ take.T, take @ own @ take.T
+        if self._second is None:
+            return mean, bank_mg2, own_mg2, 0.0
+        said = self._second.estimate(expected)
+        other = heard(self._second, said, self._change.since_s)
+        if said is None:
+            return mean, bank_mg2, own_mg2, 0.0
+        apart = distance(take @ mean - said.hard_iron_b_mg, bank_mg2, said.covariance_mg2)
+        if other is None:
+            return mean, bank_mg2, own_mg2, apart
+        much = doubt(apart)
+        mean, all_in = joined(mean, covariance, take, other.hard_iron_b_mg, much * other.covariance_mg2)
+        _, alone = joined(mean, own, take, other.hard_iron_b_mg, much * own_covariance(other))
+        return mean, take @ all_in @ take.T, take @ alone @ take.T, apart
 
 
 def without_prior(covariance: Array, h_mg: float, v_mg: float, n: Tuning) -> Array:

@@ -21,9 +21,10 @@ class Block:
     """n samples in arrays; body axes, mG, s, rad.
 
     z (n, 3) : A m + e.  north_b, east_b, down_b (n, 3) : the own frame's axes.  rate_b_rads (n, 3).
-    crosses (n, 6, 3) : cross matrices of the vehicle's tilt and of its rate.  drive (n,) : throttle - 1/2.
+    turns_b (n, 3, 6) : about what each of the states layout.TURNS turns the field.  drive (n,) : throttle - 1/2.
     calmed_rad (n,) : tilt taken out of the attitude, where it may be noise.
     ahead_s (n, 3) : integral of down_b from the sample to the block's end.
+    own_tilt_rad : sigma of the tilt where it is that of gyro and accelerometer alone, None where it is the autopilot's.
     dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
     """
 
@@ -32,7 +33,7 @@ class Block:
     east_b: Array
     down_b: Array
     rate_b_rads: Array
-    crosses: Array
+    turns_b: Array
     calmed_rad: Array
     drive: Array
     ahead_s: Array
@@ -41,7 +42,7 @@ class Block:
     turn_rad2: float
     shaping: Shaping
     axes: int
-    own_tilt: bool
+    own_tilt_rad: float | None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -99,11 +100,11 @@ class Gathering:
         bodies = np.array(self._bodies)
         down_b = bodies[:, :, 2]
         rates = np.array([s.rate_b_rads for s in self._samples])
-        crosses = np.zeros((len(rates), 6, 3))
-        for first, (x, y, z) in ((0, (-down_b[:, 1], down_b[:, 0], 0.0)), (3, rates.T)):
-            crosses[:, first, 1], crosses[:, first, 2] = -z, y
-            crosses[:, first + 1, 0], crosses[:, first + 1, 2] = z, -x
-            crosses[:, first + 2, 0], crosses[:, first + 2, 1] = -y, x
+        turns = np.zeros((len(rates), 3, 6))
+        turns[:, :, :2] = bodies[:, :, :2]
+        turns[:, 0, 2] = turns[:, 1, 3] = 1.0
+        turns[:, 0, 4], turns[:, 1, 4] = -down_b[:, 1], down_b[:, 0]
+        turns[:, :, 5] = rates
         last = self._samples[-1]
         out = Block(
             z=np.array(self._z),
@@ -111,7 +112,7 @@ class Gathering:
             east_b=bodies[:, :, 1],
             down_b=down_b,
             rate_b_rads=rates,
-            crosses=crosses,
+            turns_b=turns,
             calmed_rad=np.array(self._calmed),
             drive=np.array(self._drives),
             ahead_s=self._down_s - np.array(self._downs),
@@ -120,7 +121,7 @@ class Gathering:
             turn_rad2=self._turn_rad2,
             shaping=last.shaping,
             axes=last.axes,
-            own_tilt=last.tilt_from != "ATTITUDE",
+            own_tilt_rad=None if last.tilt_from == "ATTITUDE" else last.own_tilt_rad,
         )
         self.__init__()  # type: ignore[misc]
         return out

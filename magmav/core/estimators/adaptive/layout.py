@@ -34,4 +34,5 @@ G = slice(20, 23)
 T = 23
 KAPPA = 24
 R = slice(25, 27)
+TURNS = np.array((6, 7, 25, 26, KAPPA, T))  # all that turns the field: e, r, kappa and t
 SIZE = 27

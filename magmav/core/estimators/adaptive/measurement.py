@@ -1,10 +1,12 @@
 """The one measurement equation, for every hypothesis and every sample of a block at once.
 
-    A m + e = A b + (I + S)(u + (R_bo e_tilt + r + kappa t) x u + tau w x u) + k (throttle - 1/2) + d + noise
+    A m + e = A b + (I + S) T(q) u + k (throttle - 1/2) + d + noise
     u = R_bo (H cos a, H sin a, V),   a = alpha - g . (integral of down since the sample)
+    q = R_bo e_tilt + r + kappa t + tau w,   T(q) = I + [q x] + [q x]^2 / 2
 R_bo takes the own frame to body axes; t is the vehicle's tilt as a rotation, r that of the mounting; w the body rate.
-It holds the norm, the dip, the turning and the world model, each with its own direction. Angles of attitude appear
-nowhere: no gimbal.
+It holds the norm, the dip, the turning and the world model, each with its own direction. T is a turn but for the third
+power of its angle: with its first two terms alone a tilt ten degrees wrong would make the field longer. Angles of
+attitude appear nowhere: no gimbal.
 """
 
 from __future__ import annotations
@@ -29,6 +31,10 @@ def soft_matrix(s: Array) -> Array:
 _SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel() for unit in _EYE3])
 
 
+# (3, 9): v times this is [v x]
+_CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+
+
 def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     """Predicted A m + e (K, n, 3) mG, its Jacobian (K, n, 3, SIZE), and u (K, n, 3) mG.
 
@@ -40,21 +46,14 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     j[..., at.D] = _EYE3
     angle = (x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T)[:, :, None]
     c, s = np.cos(angle), np.sin(angle)
-    ahead = c * block.north_b + s * block.east_b  # the horizontal field's direction, and a right angle on from it
-    beside = c * block.east_b - s * block.north_b
     h = x[:, at.H, None, None]
+    ahead = c * block.north_b + s * block.east_b  # the horizontal field's direction, and a right angle on from it
+    turned = h * (c * block.east_b - s * block.north_b)
     u = h * ahead + x[:, at.V, None, None] * block.down_b
-    turned = h * beside
-    crossed = (block.crosses @ u[..., None])[..., 0]
-    leaning, late = crossed[..., :3], crossed[..., 3:]
-    v = x[:, at.V, None, None]
-    j[..., at.E.start] = h * s * block.down_b - v * block.east_b
-    j[..., at.E.start + 1] = v * block.north_b - h * c * block.down_b
-    j[..., 1, at.R.start], j[..., 2, at.R.start] = -u[..., 2], u[..., 1]
-    j[..., 0, at.R.start + 1], j[..., 2, at.R.start + 1] = u[..., 2], -u[..., 0]
-    moved = (j[..., at.E] @ x[:, None, at.E, None] + j[..., at.R] @ x[:, None, at.R, None])[..., 0]
-    moved += x[:, at.KAPPA, None, None] * leaning + x[:, at.T, None, None] * late
-    seen = u + moved
+    q = (block.turns_b @ x[:, None, at.TURNS, None])[..., 0]
+    around = cross_matrices(q)
+    turn = _EYE3 + around + 0.5 * (around @ around)
+    seen, turned, ahead, down = np.moveaxis(turn @ np.stack((u, turned, ahead, _like(block.down_b, k)), 3), 3, 0)
     soft = soft_matrix(x[:, at.S])
     constant = x[:, None, at.B] @ block.shaping.matrix.T + x[:, None, at.D]
     y = seen + seen @ soft + constant + block.drive[:, None] * x[:, None, at.K]
@@ -62,13 +61,24 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     j[..., at.ALPHA] = turning
     j[..., at.B] = block.shaping.matrix
     j[..., at.H] = ahead
-    j[..., at.V] = block.down_b
+    j[..., at.V] = down
     j[..., at.K] = block.drive[:, None, None] * _EYE3
-    j[..., at.S] = (u @ _SOFT).reshape(k, n, 3, 6)
+    j[..., at.S] = (seen @ _SOFT).reshape(k, n, 3, 6)
     j[..., at.G] = -turning[..., None] * block.ahead_s[:, None, :]
-    j[..., at.T] = late
-    j[..., at.KAPPA] = leaning
+    by_q = cross_matrices(u)
+    by_q = by_q + 0.5 * (cross_matrices((around @ u[..., None])[..., 0]) + around @ by_q)
+    j[..., at.TURNS] = -(by_q @ block.turns_b)
     return y, j, u
+
+
+def _like(values: Array, k: int) -> Array:
+    return np.broadcast_to(values, (k, *values.shape))
+
+
+def cross_matrices(v: Array) -> Array:
+    """[v x] of vectors (..., 3): (..., 3, 3)."""
+    out: Array = (v @ _CROSS).reshape(*v.shape, 3)
+    return out
 
 
 def smear(u: Array, block: Block, sync_s: float) -> Array:

@@ -16,17 +16,20 @@ from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 
 
-def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt: bool, n: Tuning) -> None:
+def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt_rad: float | None, n: Tuning) -> None:
     """Carry all hypotheses over dt_s.
 
     down_s : (3,) integral of the down direction in body axes over the step, s: what a gyro bias turns alpha by.
-    turn_rad2 : variance of the turn the gyro reported.  own_tilt : the tilt is that of gyro and accelerometer alone.
+    turn_rad2 : variance of the turn the gyro reported.  own_tilt_rad : sigma of the tilt
+    where it is that of gyro and accelerometer alone, else None.
     """
     x, p = bank.x, bank.p
     x[:, at.ALPHA] += x[:, at.G] @ down_s
     p[:, at.ALPHA, :] += down_s @ p[:, at.G, :]
     p[:, :, at.ALPHA] += p[:, :, at.G] @ down_s
-    tilt_rad, tilt_tau_s = (n.own_tilt_rad, n.own_tilt_tau_s) if own_tilt else (n.tilt_rad, n.tilt_tau_s)
+    tilt_rad, tilt_tau_s = (
+        (n.tilt_rad, n.tilt_tau_s) if own_tilt_rad is None else (n.own_tilt_doubt * own_tilt_rad, n.own_tilt_tau_s)
+    )
     tilt, short = math.exp(-dt_s / tilt_tau_s), math.exp(-dt_s / n.disturbance_tau_s)
     fade = np.ones(at.SIZE)
     fade[at.E], fade[at.D] = tilt, short

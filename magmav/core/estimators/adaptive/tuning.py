@@ -51,7 +51,6 @@ class Tuning:
     tilt_rad: float = math.radians(1.0)
     tilt_tau_s: float = 15.0
     least_tilt_rad: float = math.radians(1.2)  # RMS per axis: less may be nothing but noise of the attitude
-    own_tilt_rad: float = math.radians(5.0)  # of gyro and accelerometer alone, misled by every acceleration
     own_tilt_doubt: float = 3.0  # the sigma claimed then is so many times the filter's: measured error / sigma was 3
     own_tilt_tau_s: float = 6.0
     disturbance_mg: float = 1.5
