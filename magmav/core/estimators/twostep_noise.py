@@ -65,7 +65,7 @@ class Noise:
         usual2 = self.structure2 + self.white2 / values
         nis = mean * mean / (doubt2 + usual2)
         self.nis += 0.2 * (min(nis, 16.0) - self.nis)
-        self.alarm2 = max(0.7 * self.alarm2, mean * mean - n.clip * (doubt2 + usual2))
+        self.alarm2 = max((0.7 if nis > 4.0 else 0.4) * self.alarm2, mean * mean - n.clip * (doubt2 + usual2))
         # What a doubtful answer foretold badly says little about noise: weights as of variances' own variance.
         sure = (usual2 / (usual2 + doubt2)) ** 2
         self._weight = min(self._weight + sure, n.memory_s)

@@ -25,7 +25,7 @@ from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
 from magmav.core.estimators.adaptive.opinion import doubt, heard, joined, own_covariance
 from magmav.core.estimators.adaptive.process import advance
-from magmav.core.estimators.adaptive.robust import Tilting, WildGate, adapt, between, doubted
+from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
@@ -39,6 +39,7 @@ _FLOOR_MG = (
     0.5,
     1.0,
 )  # lower than others': how much structure the readings have shows in its noise
+_BESIDE_MG = 5.0  # what the second opinion may be off beyond twice its sigma, where it competes
 _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 
 
@@ -51,6 +52,7 @@ class AdaptiveEstimator:
         self._bank: Bank | None = None
         self._gathering = Gathering()
         self._wild = WildGate()
+        self._still = Stillness()
         self._tilting = Tilting()
         self._change = ChangeWatch(self.tuning)
         self._second = TwostepEstimator() if second else None
@@ -63,6 +65,7 @@ class AdaptiveEstimator:
         self._residual_mg2 = 0.0
         self._residual_n = 0
         self._nis = 1.0
+        self._joined_ago_s = 0.0
         self._axes = 3
         self._own_tilt = False
         self._matrix: Array = _EYE3
@@ -86,11 +89,15 @@ class AdaptiveEstimator:
         down_b, dt = body_from_own[:, 2], max(s.dt_s, 0.0)
         walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
         about_down = float(s.rate_b_rads @ down_b) * dt
-        gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
-        self._lost = self._lost or s.gap
-        if not s.learn:
-            return
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        still = s.learn and self._still.step(z, s.rate_b_rads, dt) and not len(gathering)
+        if still:
+            gathering.rests(dt, about_down)
+        else:
+            gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
+        self._lost = self._lost or s.gap
+        if not s.learn or still:
+            return
         if self._wild.step(z, math.hypot(*s.rate_b_rads.tolist()) * dt):
             return
         self._samples += 1
@@ -141,11 +148,36 @@ class AdaptiveEstimator:
             bank.lose_heading(n)
             self._lost = False
         if block.dt_s > 0.0 and self._blocks:
+            bank.x[:, at.ALPHA] += block.turned_rad
             advance(bank, block.dt_s, block.down_s, block.turn_rad2, block.own_tilt_rad, n)
         self._update(bank, block)
         self._blocks += 1
-        if self._blocks % n.prune_every == 0 and len(bank) > len(MODELS):
-            bank.tidy(n, n.most if self._blocks * n.block_s > n.narrow_s else len(bank))
+        self._joined_ago_s += block.dt_s
+        if self._blocks % n.prune_every:
+            return
+        if self._joined_ago_s > n.join_every_s:
+            self._compete(block)
+        if len(self._bank or ()) > len(MODELS):
+            assert self._bank is not None
+            self._bank.tidy(n, n.most if self._blocks * n.block_s > n.narrow_s else len(self._bank))
+
+    def _compete(self, block: Block) -> None:
+        """Where the second opinion is another, let it compete: the bank may have gone astray."""
+        bank, second = self._bank, self._second
+        said = None if second is None else second.estimate(None)
+        if bank is None or second is None or said is None or heard(second, said, self._change.since_s) is None:
+            return
+        mean, covariance = bank.mixture()
+        apart = distance(mean[at.B] - said.hard_iron_b_mg, covariance[at.B, at.B], said.covariance_mg2)
+        if apart > self.tuning.join_apart:
+            self._joined_ago_s = 0.0
+            bank.join(
+                said.hard_iron_b_mg,
+                2.0 * np.sqrt(np.diag(said.covariance_mg2)) + _BESIDE_MG,
+                block,
+                self._model_mg,
+                self.tuning,
+            )
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
@@ -182,13 +214,22 @@ class AdaptiveEstimator:
             like = float(bank.product[best] / max(bank.square[best], 0.1))
             changed = self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
-                self._change.open(bank)
-                self._residual_n = 0
+                self._open(bank, block)
         self._nis += min(block.dt_s, 0.5) * (float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis)
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
         self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
+
+    def _open(self, bank: Bank, block: Block) -> None:
+        """The iron has changed. What else is known stays; where that is not even the field, begin anew."""
+        n = self.tuning
+        self._residual_n = 0
+        self._change.open(bank)
+        if self._model_mg is None and math.sqrt(bank.mixture()[1][at.H, at.H]) > n.blind_h_mg[1] * n.field_known:
+            field = (*n.blind_h_mg, float(block.z[-1] @ block.down_b[-1]), n.blind_v_mg)
+            self._bank = Bank.begun(field, n)
+            self._blocks = 0
 
     # ------------------------------------------------------------ answer
 

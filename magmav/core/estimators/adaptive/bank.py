@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
+from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array, Index
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import TAU
 
 _COLUMNS: tuple[str, ...] = ("x", "p", "model", "log_weight", "prior", "walk_mg")
+_ASTRAY = 5.0  # of the log weight, each time
+_LEAST = -15.0  # from there a hypothesis that foretells better is back within seconds
 _COLUMNS += ("white_mg2", "common_mg2", "disturbance_mg", "square", "product", "last")
 
 
@@ -77,6 +81,28 @@ class Bank:
         log_weight = np.log([MODELS[m].weight / n.yaws for m in model])
         return Bank(x, p, model, log_weight, n)
 
+    def join(
+        self, iron_mg: Array, sigma_mg: Array, block: Block, model_mg: tuple[float, float] | None, n: Tuning
+    ) -> None:
+        """Let somebody else's iron, (3,) and its sigmas, compete: one hypothesis per model that begins there.
+
+        The last reading then says where north is and, without a model, how strong the field.
+        """
+        u = block.z[-1] - block.shaping.matrix @ iron_mg
+        north, east, down = (float(axis[-1] @ u) for axis in (block.north_b, block.east_b, block.down_b))
+        doubt_mg = float(np.linalg.norm(sigma_mg))
+        blind = (math.hypot(north, east), doubt_mg, down, doubt_mg)
+        field = blind if model_mg is None else (model_mg[0], n.model_mg, model_mg[1], n.model_mg)
+        new = Bank.begun(field, replace(n, yaws=1), iron_mg)
+        diagonal = np.einsum("kii->ki", new.p)
+        diagonal[:, at.B] = sigma_mg**2
+        new.x[:, at.ALPHA] = math.atan2(east, north)
+        diagonal[:, at.ALPHA] = min(doubt_mg / max(blind[0], doubt_mg), 1.0) ** 2
+        best = float(self.log_weight.max())
+        new.log_weight += best - n.join_behind
+        for name in _COLUMNS:
+            setattr(self, name, np.concatenate((getattr(self, name), getattr(new, name))))
+
     def lose_heading(self, n: Tuning) -> None:
         """Any heading again: the best of each model goes on from every direction, with all else that it knows."""
         w = self.weights()
@@ -133,7 +159,9 @@ class Bank:
         """Better foretold, more believed; old merit fades, so that a model can come back."""
         fade = math.exp(-dt_s / n.forget_s)
         self.log_weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
-        self.log_weight -= self.log_weight.max()
+        astray = np.abs(self.x[:, at.S]).max(1) > n.soft_most
+        self.log_weight -= np.where(astray, _ASTRAY, 0.0)
+        self.log_weight = np.maximum(self.log_weight - self.log_weight.max(), _LEAST)
 
     def tidy(self, n: Tuning, most: int) -> None:
         """Drop what is not believed, merge what has become the same; the best of each model stays, and few others."""

@@ -26,6 +26,7 @@ class Block:
     ahead_s (n, 3) : integral of down_b from the sample to the block's end.
     own_tilt_rad : sigma of the tilt where it is that of gyro and accelerometer alone, None where it is the autopilot's.
     dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
+    turned_rad : what the own frame turned about its down while the vehicle stood still.
     """
 
     z: Array
@@ -40,6 +41,7 @@ class Block:
     dt_s: float
     down_s: Array
     turn_rad2: float
+    turned_rad: float
     shaping: Shaping
     axes: int
     own_tilt_rad: float | None
@@ -60,7 +62,7 @@ class Gathering:
         self._downs: list[Array] = []  # integral of down_b up to each sample
         self._dt_s = 0.0
         self._down_s: Array = np.zeros(3)
-        self._turn_rad2 = 0.0
+        self._turn_rad2 = self._turned_rad = 0.0
         self._first_s = 0.0
 
     def __len__(self) -> int:
@@ -77,6 +79,11 @@ class Gathering:
             return True
         last = self._samples[-1]
         return s.shaping is last.shaping and s.axes == last.axes and s.tilt_from == last.tilt_from
+
+    def rests(self, dt_s: float, turned_rad: float) -> None:
+        """Time goes by and nothing turns but, by a gyro's error, the own frame about its down."""
+        self._dt_s += dt_s
+        self._turned_rad += turned_rad
 
     def passes(self, dt_s: float, down_b: Array, turn_rad2: float) -> None:
         """Time goes by."""
@@ -119,6 +126,7 @@ class Gathering:
             dt_s=self._dt_s,
             down_s=self._down_s,
             turn_rad2=self._turn_rad2,
+            turned_rad=self._turned_rad,
             shaping=last.shaping,
             axes=last.axes,
             own_tilt_rad=None if last.tilt_from == "ATTITUDE" else last.own_tilt_rad,

@@ -19,6 +19,8 @@ from magmav.core.rotation import rotation
 _WILD_MG, _WILD_MG_PER_RAD = 50.0, 330.0
 _WILD_OF = 5
 _TILTS, _TILTS_LEAST = 3000, 100  # readings remembered, and wanted before anything is made of them
+_STILL_RADS, _STILL_MG = 0.02, 4.0  # slower than the bias of a bad gyro, and less change than noise leaves
+_STILL_MEAN_S, _STILL_S = 1.0, 3.0
 _MEDIAN_TO_VARIANCE = 2.2  # variance of a normal value over the squared median of its size
 
 
@@ -39,6 +41,33 @@ class WildGate:
         middle = [sorted(axis)[len(self._last) // 2] for axis in zip(*self._last, strict=True)]
         off: float = max(abs(x - middle[0]), abs(y - middle[1]), abs(w - middle[2]))
         return bool(off > _WILD_MG + _WILD_MG_PER_RAD * sum(self._turns))
+
+
+class Stillness:
+    """Does the vehicle stand still? The same reading again and again says nothing new.
+
+    Taken in as if it did, a linear filter finds information in the changes of its own Jacobian: a minute on a table
+    talked the bank into a level field of nothing.
+    """
+
+    def __init__(self) -> None:
+        self._anchor: Array | None = None
+        self._mean: Array = np.zeros(3)
+        self._rate2 = 0.0
+        self._still_s = 2.0 * _STILL_S  # until it is seen to move
+
+    def step(self, z: Array, rate_b_rads: Array, dt_s: float) -> bool:
+        """Take a reading (3,), the body rate, and the time since the one before."""
+        weight = 1.0 - math.exp(-dt_s / _STILL_MEAN_S)
+        self._rate2 += weight * (float(rate_b_rads @ rate_b_rads) - self._rate2)
+        self._mean = self._mean + weight * (z - self._mean)
+        if self._anchor is None:
+            self._anchor = self._mean = z
+        far = float(np.abs(self._mean - self._anchor).max())
+        if far > _STILL_MG or self._rate2 > _STILL_RADS**2 or dt_s > 1.0:
+            self._anchor, self._still_s = self._mean, 0.0
+        self._still_s += dt_s
+        return self._still_s > _STILL_S
 
 
 class Tilting:

@@ -36,6 +36,8 @@ class Tuning:
         80.0,
     )  # without a position: mean and sigma
     blind_v_mg: float = 200.0
+    field_known: float = 0.25  # of that sigma of H is left when the field counts as learnt
+    soft_most: float = 0.15  # more is no soft iron but a filter gone astray
     block_s: float = 0.2  # readings taken in together span at most this
     block_readings: int = 6  # and are at most so many
     white_mg: float = 5.0  # one reading's own noise at first, and its limits
@@ -51,8 +53,8 @@ class Tuning:
     tilt_rad: float = math.radians(1.0)
     tilt_tau_s: float = 15.0
     least_tilt_rad: float = math.radians(1.2)  # RMS per axis: less may be nothing but noise of the attitude
-    own_tilt_doubt: float = 3.0  # the sigma claimed then is so many times the filter's: measured error / sigma was 3
-    own_tilt_tau_s: float = 6.0
+    own_tilt_doubt: float = 3.0  # times what gyro and accelerometer claim of their tilt: the error goes with the motion
+    own_tilt_tau_s: float = 3.0
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
     disturbance_hi_mg: float = 7.0
@@ -68,6 +70,9 @@ class Tuning:
     temper: float = 0.25
     forget_s: float = 60.0
     prune_every: int = 8
+    join_apart: float = 3.0  # sigmas between bank and second opinion, for this to compete in the bank
+    join_every_s: float = 8.0
+    join_behind: float = 2.0  # in log weight
     prune_below: float = 1e-4
     narrow_s: float = 20.0  # of learning; from then on
     most: int = 6  # hypotheses are kept, and the best of each model
