@@ -26,7 +26,7 @@ from magmav.core.estimators.adaptive.measurement import equation, smear, soft_ma
 from magmav.core.estimators.adaptive.opinion import doubt, heard, joined, own_covariance
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
-from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.estimators.adaptive.tuning import MODELS, SOFT_IRON, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
@@ -61,6 +61,7 @@ class AdaptiveEstimator:
         self._by_hand = False
         self._drive = 0.0  # mean of what k is multiplied with
         self._driven = 0
+        self._drive2 = 0.0  # its variance
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
@@ -106,6 +107,7 @@ class AdaptiveEstimator:
             drive = s.throttle - 0.5
             self._driven = min(self._driven + 1, 2000)
             self._drive += (drive - self._drive) / self._driven
+            self._drive2 += ((drive - self._drive) ** 2 - self._drive2) / self._driven
         if self._bank is None:
             self._bank = Bank.begun(self._prior(s, z, down_b), n)
         if self._by_hand and not s.by_hand:
@@ -215,7 +217,8 @@ class AdaptiveEstimator:
             changed = self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
-        self._nis += min(block.dt_s, 0.5) * (float(np.minimum(strange[best], _STRANGEST).mean()) / k - self._nis)
+        strangeness = float(np.minimum(strange[best], _STRANGEST).mean()) / k
+        self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
@@ -273,8 +276,8 @@ class AdaptiveEstimator:
         self, mean: Array, covariance: Array, own: Array, take: Array, expected: ExpectedField | None
     ) -> tuple[Array, Array, Array, float]:
         """State with the second opinion, covariance of the iron and that without the model, and sigmas between both."""
-        bank_mg2, own_mg2 = take @ covariance @ take.T, take @ own @ take.T
-        if self._second is None:
+        bank, bank_mg2, own_mg2 = self._bank, take @ covariance @ take.T, take @ own @ take.T
+        if self._second is None or bank is None:
             return mean, bank_mg2, own_mg2, 0.0
         said = self._second.estimate(expected)
         other = heard(self._second, said, self._change.since_s)
@@ -284,8 +287,11 @@ class AdaptiveEstimator:
         if other is None:
             return mean, bank_mg2, own_mg2, apart
         much = doubt(apart)
-        mean, all_in = joined(mean, covariance, take, other.hard_iron_b_mg, much * other.covariance_mg2)
-        _, alone = joined(mean, own, take, other.hard_iron_b_mg, much * own_covariance(other))
+        if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank, to the second opinion it does not
+            much *= 1.0 + self.tuning.soft_doubt * bank.share(SOFT_IRON) ** 2
+        motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3  # which it knows nothing of
+        mean, all_in = joined(mean, covariance, take, other.hard_iron_b_mg, much * other.covariance_mg2 + motors)
+        _, alone = joined(mean, own, take, other.hard_iron_b_mg, much * own_covariance(other) + motors)
         return mean, take @ all_in @ take.T, take @ alone @ take.T, apart
 
 

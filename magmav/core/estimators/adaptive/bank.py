@@ -10,7 +10,7 @@ import numpy as np
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array, Index
-from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
+from magmav.core.estimators.adaptive.tuning import MODELS, Model, Tuning
 from magmav.core.rotation import TAU
 
 _COLUMNS: tuple[str, ...] = ("x", "p", "model", "log_weight", "prior", "walk_mg")
@@ -149,6 +149,10 @@ class Bank:
         """(K,) that add to one."""
         w = np.exp(self.log_weight - self.log_weight.max())
         return np.asarray(w / w.sum())
+
+    def share(self, model: Model) -> float:
+        """How much one model is believed."""
+        return float(self.weights()[self.model == MODELS.index(model)].sum())
 
     def keep(self, rows: Index) -> None:
         """Only these, in this order."""

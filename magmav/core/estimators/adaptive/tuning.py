@@ -18,9 +18,9 @@ class Model:
 
 
 HARD = Model(0.70, 0.05, 0.005, 0.0035, math.radians(0.3))
-SOFT = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.5))
+SOFT_IRON = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.5))
 DRIFT = Model(0.03, 0.7, 0.005, 0.0035, math.radians(0.3))
-MODELS = (HARD, SOFT, DRIFT)
+MODELS = (HARD, SOFT_IRON, DRIFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +70,7 @@ class Tuning:
     temper: float = 0.25
     forget_s: float = 60.0
     prune_every: int = 8
+    soft_doubt: float = 9.0  # by how much more the second opinion is doubted where all believe in soft iron
     join_apart: float = 3.0  # sigmas between bank and second opinion, for this to compete in the bank
     join_every_s: float = 8.0
     join_behind: float = 2.0  # in log weight
