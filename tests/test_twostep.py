@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from synthetic_flight import turn
 
 from magmav.core.estimators import ESTIMATORS
-from magmav.core.estimators.twostep import TwostepEstimator, disagreement
+from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.estimators.twostep_equation import C, D, drawn, rows, soft_root, symmetric
 from magmav.core.estimators.twostep_noise import Tuning
 from magmav.core.estimators.twostep_window import Blocks, Sieve
@@ -469,6 +469,10 @@ def opinion(iron, variances, says=(True, True, True)):
     return replace(ONE, hard_iron_b_mg=vec3(iron, "b"), covariance_mg2=np.diag(variances), says_b=says)
 
 
+def disagreement(a, b):
+    return distance(a.hard_iron_b_mg - b.hard_iron_b_mg, a.covariance_mg2, b.covariance_mg2)
+
+
 def test_disagreement_is_the_distance_in_sigmas_of_both():
     a, b = opinion((10.0, 0.0, 0.0), (9.0, 9.0, 9.0)), opinion((0.0, 0.0, 0.0), (16.0, 16.0, 16.0))
     assert disagreement(a, b) == pytest.approx(2.0)
@@ -482,10 +486,8 @@ def test_who_knows_nothing_of_a_direction_cannot_contradict_there():
     sure, vague = opinion((0.0, 0.0, 500.0), (4.0, 4.0, 4.0)), opinion((6.0, 0.0, 0.0), (5.0, 5.0, 300.0**2))
     assert disagreement(sure, vague) == pytest.approx(2.0)
     assert disagreement(vague, sure) > 1.5  # there the second opinion knows
-    silent = opinion((6.0, 0.0, 0.0), (5.0, 5.0, 5.0), (False, False, False))
+    silent = opinion((6.0, 0.0, 0.0), (300.0**2,) * 3)
     assert disagreement(sure, silent) == 0.0
-    flat = opinion((6.0, 0.0, 0.0), (5.0, 5.0, 5.0), (True, True, False))
-    assert disagreement(sure, flat) == pytest.approx(2.0)
 
 
 @settings(max_examples=20, deadline=None)

@@ -27,7 +27,7 @@ from real_bench.tapes import Tape
 Floats = NDArray[np.float64]
 LEARN_FOR_S = (30.0, 60.0, *np.arange(80.0, 251.0, 10.0).tolist())
 LEAST_REST_S = 10.0  # a shorter rest of a flight says nothing
-_TILT_SIGMA_RAD = math.radians(0.7)  # as Channel has it
+_TILT_SIGMA_RAD, _OWN_TILT_SIGMA_RAD = math.radians(0.7), math.radians(2.0)  # as Channel has them
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Judge:
         for i in within[:: max(1, len(within) // 200)]:
             s, c = self._samples[i].sample, self._samples[i].circumstances
             h, v = field_of(e, c.expected)
-            tilt = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else s.own_tilt_rad
+            tilt = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else max(_OWN_TILT_SIGMA_RAD, s.own_tilt_rad)
             squares.append(heading_sigma(covariance_of_field(s, e), h, v, s.roll_rad, s.pitch_rad, tilt) ** 2)
         return math.degrees(math.sqrt(float(np.mean(squares))))
 

@@ -26,6 +26,7 @@ from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_he
 from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
 
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
+_OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone, at least
 _UPSET_S = 3.0  # after a sudden change no heading is published: its sigma is that of an answer on its way
 _GUESS_RAD = math.radians(22.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
@@ -162,7 +163,7 @@ class Channel:
         sigma = gate.floored(e)
         horizontal, down = field_of(e, c.expected)
         covariance = covariance_of_field(s, e)
-        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else s.own_tilt_rad
+        tilt_sigma = _TILT_SIGMA_RAD if s.tilt_from == "ATTITUDE" else max(_OWN_TILT_SIGMA_RAD, s.own_tilt_rad)
         self._belief = _Belief(
             s.boot_ns,
             e,

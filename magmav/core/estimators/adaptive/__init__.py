@@ -5,6 +5,7 @@ block        a few samples in a row, taken in together
 process      how time passes
 measurement  the one equation and its Jacobian
 bank         hypotheses and weights
+answer       what is made of them
 robust       wild readings, doubt, and noise as it shows
 change       a sudden change of the iron
 opinion      what the field's length alone says, joined to it
@@ -18,12 +19,13 @@ import math
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.bank import Bank, field_covariance
+from magmav.core.estimators.adaptive.answer import symmetric, without_prior
+from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
-from magmav.core.estimators.adaptive.opinion import doubt, heard, joined, own_covariance
+from magmav.core.estimators.adaptive.opinion import doubt, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import MODELS, SOFT_IRON, Tuning
@@ -70,6 +72,7 @@ class AdaptiveEstimator:
         self._axes = 3
         self._own_tilt = False
         self._matrix: Array = _EYE3
+        self._inverse: Array = _EYE3
         self._model_mg: tuple[float, float] | None = None
 
     # ------------------------------------------------------------ time
@@ -88,18 +91,16 @@ class AdaptiveEstimator:
         if body_from_own is None:
             body_from_own = body_from_earth(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
         down_b, dt = body_from_own[:, 2], max(s.dt_s, 0.0)
-        walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
-        about_down = float(s.rate_b_rads @ down_b) * dt
         z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
-        still = s.learn and self._still.step(z, s.rate_b_rads, dt) and not len(gathering)
+        about_down, rate = float(s.rate_b_rads @ down_b) * dt, math.hypot(*s.rate_b_rads.tolist())
+        still = s.learn and self._still.step(z, rate, dt) and not len(gathering)
         if still:
             gathering.rests(dt, about_down)
         else:
+            walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
             gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
         self._lost = self._lost or s.gap
-        if not s.learn or still:
-            return
-        if self._wild.step(z, math.hypot(*s.rate_b_rads.tolist()) * dt):
+        if not s.learn or still or self._wild.step(z, rate * dt):
             return
         self._samples += 1
         drive = self._drive
@@ -167,7 +168,7 @@ class AdaptiveEstimator:
         """Where the second opinion is another, let it compete: the bank may have gone astray."""
         bank, second = self._bank, self._second
         said = None if second is None else second.estimate(None)
-        if bank is None or second is None or said is None or heard(second, said, self._change.since_s) is None:
+        if bank is None or second is None or said is None or stale(second, self._change.since_s):
             return
         mean, covariance = bank.mixture()
         apart = distance(mean[at.B] - said.hard_iron_b_mg, covariance[at.B, at.B], said.covariance_mg2)
@@ -183,7 +184,10 @@ class AdaptiveEstimator:
 
     def _update(self, bank: Bank, block: Block) -> None:
         n, k, count, size = self.tuning, block.axes, len(bank), len(block)
-        self._axes, self._matrix, self._own_tilt = k, block.shaping.matrix, block.own_tilt_rad is not None
+        self._axes, self._own_tilt = k, block.own_tilt_rad is not None
+        if self._matrix is not block.shaping.matrix:
+            self._matrix = block.shaping.matrix
+            self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
@@ -242,16 +246,17 @@ class AdaptiveEstimator:
             return None
         mean, covariance = self._bank.mixture()
         take = np.zeros((3, at.SIZE))  # iron at mean throttle
-        take[:, at.B], take[:, at.K] = _EYE3, self._drive * np.linalg.inv(self._matrix)
-        own = covariance
+        take[:, at.B], take[:, at.K] = _EYE3, self._drive * self._inverse
+        pulled = covariance @ take.T
+        iron_mg2 = own_mg2 = take @ pulled
         if self._model_mg is not None:
-            own = without_prior(covariance, *self._model_mg, self.tuning)
+            field_mg2 = covariance[at.H : at.V + 1, at.H : at.V + 1]
+            own_mg2 = without_prior(iron_mg2, pulled[at.H : at.V + 1], field_mg2, *self._model_mg, self.tuning)
         if self._tilting.rms_rad < self.tuning.least_tilt_rad:  # it may be the attitude's own noise that tilts
-            unknown = np.zeros((at.SIZE, at.SIZE))
-            unknown[at.B, at.B] = _DOWN * self.tuning.blind_v_mg**2
-            own = own + unknown
-            covariance = covariance if self._model_mg is not None else covariance + unknown
-        mean, iron_mg2, own_mg2, apart = self._joined(mean, covariance, own, take, expected)
+            unknown = _DOWN * self.tuning.blind_v_mg**2
+            own_mg2 = own_mg2 + unknown
+            iron_mg2 = iron_mg2 if self._model_mg is not None else iron_mg2 + unknown
+        mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
         soft = _EYE3 + soft_matrix(mean[at.S])
         return Estimate(
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
@@ -273,42 +278,26 @@ class AdaptiveEstimator:
         )
 
     def _joined(
-        self, mean: Array, covariance: Array, own: Array, take: Array, expected: ExpectedField | None
+        self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None
     ) -> tuple[Array, Array, Array, float]:
-        """State with the second opinion, covariance of the iron and that without the model, and sigmas between both."""
-        bank, bank_mg2, own_mg2 = self._bank, take @ covariance @ take.T, take @ own @ take.T
-        if self._second is None or bank is None:
-            return mean, bank_mg2, own_mg2, 0.0
-        said = self._second.estimate(expected)
-        other = heard(self._second, said, self._change.since_s)
-        if said is None:
-            return mean, bank_mg2, own_mg2, 0.0
-        apart = distance(take @ mean - said.hard_iron_b_mg, bank_mg2, said.covariance_mg2)
-        if other is None:
-            return mean, bank_mg2, own_mg2, apart
+        """State with the second opinion, covariance of the iron and that without the model, and sigmas between both.
+
+        take (3, n) : the iron of a state.  pulled (n, 3) : covariance of state and iron.
+        """
+        bank, second = self._bank, self._second
+        said = None if second is None else second.estimate(expected)
+        if bank is None or second is None or said is None:
+            return mean, iron_mg2, own_mg2, 0.0
+        off = said.hard_iron_b_mg - take @ mean
+        apart = distance(off, iron_mg2, said.covariance_mg2)
+        if stale(second, self._change.since_s):
+            return mean, iron_mg2, own_mg2, apart
         much = doubt(apart)
         if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank, to the second opinion it does not
             much *= 1.0 + self.tuning.soft_doubt * bank.share(SOFT_IRON) ** 2
         motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3  # which it knows nothing of
-        mean, all_in = joined(mean, covariance, take, other.hard_iron_b_mg, much * other.covariance_mg2 + motors)
-        _, alone = joined(mean, own, take, other.hard_iron_b_mg, much * own_covariance(other) + motors)
-        return mean, take @ all_in @ take.T, take @ alone @ take.T, apart
-
-
-def without_prior(covariance: Array, h_mg: float, v_mg: float, n: Tuning) -> Array:
-    """The covariance had the field not been known beforehand, (n, n): the prior on (H, V) taken out, a wide one put in.
-
-    A prior is a measurement, and a measurement can be taken back: P + P C' (R - C P C')^-1 C P, with R^-1 the
-    difference of the two priors' information.
-    """
-    known = np.linalg.inv(field_covariance(h_mg, v_mg, n))
-    wide = np.diag((1.0 / n.blind_h_mg[1] ** 2, 1.0 / n.blind_v_mg**2))
-    now = covariance[at.H : at.V + 1, at.H : at.V + 1]
-    left = np.linalg.inv(known - wide) - now
-    left = 0.5 * (left + left.T)
-    least = np.linalg.eigvalsh(left)[0]
-    if least < 1e-3:  # nothing but the prior is known of it
-        left = left + (1e-3 - least) * np.eye(2)
-    columns = covariance[:, at.H : at.V + 1]
-    out: Array = covariance + columns @ np.linalg.solve(left, columns.T)
-    return out
+        weight = np.linalg.inv(iron_mg2 + much * said.covariance_mg2 + motors)
+        mean = mean + pulled @ (weight @ off)
+        iron_mg2 = iron_mg2 - iron_mg2 @ weight @ iron_mg2
+        own_mg2 = own_mg2 - own_mg2 @ np.linalg.solve(own_mg2 + much * own_covariance(said) + motors, own_mg2)
+        return mean, symmetric(iron_mg2), symmetric(own_mg2), apart

@@ -78,7 +78,10 @@ class Gathering:
         if not self._samples:
             return True
         last = self._samples[-1]
-        return s.shaping is last.shaping and s.axes == last.axes and s.tilt_from == last.tilt_from
+        if s.axes != last.axes or s.tilt_from != last.tilt_from:
+            return False
+        a, b = s.shaping.matrix, last.shaping.matrix
+        return a is b or bool((a == b).all())
 
     def rests(self, dt_s: float, turned_rad: float) -> None:
         """Time goes by and nothing turns but, by a gyro's error, the own frame about its down."""

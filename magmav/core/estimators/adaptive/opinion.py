@@ -17,24 +17,14 @@ _APART = 1.5  # sigmas between the two from which on the second counts less
 _SINCE_S = 2.0  # it must have begun its stretch of data no longer than this before the last change of the iron
 
 
-def heard(second: TwostepEstimator, estimate: Estimate | None, changed_ago_s: float) -> Estimate | None:
-    """What it says, unless that rests on data from before the iron changed."""
-    if estimate is None or second.reaches_back_s > changed_ago_s + _SINCE_S:
-        return None
-    return estimate
+def stale(second: TwostepEstimator, changed_ago_s: float) -> bool:
+    """Does what it says rest on data from before the iron changed?"""
+    return second.reaches_back_s > changed_ago_s + _SINCE_S
 
 
 def doubt(apart: float) -> float:
     """By what the second's variance is multiplied when the two are so many sigmas apart."""
     return max(1.0, apart / _APART) ** 4
-
-
-def joined(mean: Array, covariance: Array, take: Array, iron_mg: Array, iron_mg2: Array) -> tuple[Array, Array]:
-    """State (n,) and covariance (n, n) with a measurement of the iron, (3,) and (3, 3); take (3, n) is its Jacobian."""
-    pulled = covariance @ take.T
-    gain = pulled @ np.linalg.inv(take @ pulled + iron_mg2)
-    left = covariance - gain @ pulled.T
-    return mean + gain @ (iron_mg - take @ mean), 0.5 * (left + left.T)
 
 
 def own_covariance(second: Estimate) -> Array:

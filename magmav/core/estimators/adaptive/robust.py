@@ -51,19 +51,21 @@ class Stillness:
     """
 
     def __init__(self) -> None:
-        self._anchor: Array | None = None
-        self._mean: Array = np.zeros(3)
+        self._anchor: tuple[float, float, float] | None = None
+        self._mean = (0.0, 0.0, 0.0)
         self._rate2 = 0.0
         self._still_s = 2.0 * _STILL_S  # until it is seen to move
 
-    def step(self, z: Array, rate_b_rads: Array, dt_s: float) -> bool:
-        """Take a reading (3,), the body rate, and the time since the one before."""
+    def step(self, z: Array, rate_rads: float, dt_s: float) -> bool:
+        """Take a reading (3,), how fast it turns, and the time since the one before."""
         weight = 1.0 - math.exp(-dt_s / _STILL_MEAN_S)
-        self._rate2 += weight * (float(rate_b_rads @ rate_b_rads) - self._rate2)
-        self._mean = self._mean + weight * (z - self._mean)
+        self._rate2 += weight * (rate_rads * rate_rads - self._rate2)
+        x, y, w = z.tolist()
+        a, b, c = self._mean
         if self._anchor is None:
-            self._anchor = self._mean = z
-        far = float(np.abs(self._mean - self._anchor).max())
+            self._anchor = a, b, c = x, y, w
+        self._mean = a, b, c = a + weight * (x - a), b + weight * (y - b), c + weight * (w - c)
+        far = max(abs(a - self._anchor[0]), abs(b - self._anchor[1]), abs(c - self._anchor[2]))
         if far > _STILL_MG or self._rate2 > _STILL_RADS**2 or dt_s > 1.0:
             self._anchor, self._still_s = self._mean, 0.0
         self._still_s += dt_s

@@ -18,7 +18,7 @@ class Model:
 
 
 HARD = Model(0.70, 0.05, 0.005, 0.0035, math.radians(0.3))
-SOFT_IRON = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.5))
+SOFT_IRON = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.3))
 DRIFT = Model(0.03, 0.7, 0.005, 0.0035, math.radians(0.3))
 MODELS = (HARD, SOFT_IRON, DRIFT)
 
