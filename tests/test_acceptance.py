@@ -1,8 +1,9 @@
-"""Acceptance tests of users.md that no other file holds: AT-2b, 2c, 3b, 12a to 12d, of the service's default estimator.
+"""Acceptance tests of users.md, of the service's default estimator; the rest of each is where the last test finds it.
 
 AT-1 test_planar and test_deviation, AT-2a, 2d, 3a, 3d, 11, 15, 19, 20 test_causes, AT-3c test_coach, AT-17 test_trust.
 """
 
+import ast
 import json
 import math
 import pickle
@@ -13,22 +14,43 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ground_frames import COPTER, frames
-from honest_flight import EXPECTED, MOTIONS, Motion, body_rates, field_in_body, figure_eight, samples
-from memory_flight import Bench
-from synthetic_flight import EARTH_MG, HARD_IRON_MG
-from test_causes import bent, watch
-from test_channel import HERE, channel, run
+from ground_frames import BOAT, COPTER, ROVER, boat, eased, frames, rover, true_yaw
+from honest_flight import (
+    EXPECTED,
+    MOTIONS,
+    RATE_HZ,
+    Motion,
+    body_rates,
+    field_in_body,
+    figure_eight,
+    samples,
+    wander,
+)
+from matplotlib.axes import Axes
+from matplotlib.text import Text
+from memory_flight import Bench, Teller
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from synthetic_flight import DECLINATION_RAD, EARTH_MG, HARD_IRON_MG
+from test_causes import MOUNTS, about, arc, bent, mounted, watch
+from test_channel import HERE, NOWHERE, channel, run
 from test_geomag import NOAA, unix_ns
+from test_kalman import yaw_only
+from test_planar import STORED_Z, driven, onto_a_ramp
 
+from magmav.appraisal import CompassLog, describe
 from magmav.core.causes import Causes
+from magmav.core.coach import advise, next_step
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.excitation import Excitation
-from magmav.core.types import NO_SHAPING, AxisState, Sample, State, VehicleReading, vec3
+from magmav.core.field import ExpectedField
+from magmav.core.types import NO_SHAPING, AxisState, Reason, Sample, State, VehicleReading, vec3
 from magmav.geomag import world_magnetic_model
+from magmav.reference import Reference
 from magmav.settings import Place, Settings
 from magmav.vehicle import Vehicle
+from magmav.view.plots import TraceCollector, plot_replay
 from magmav.view.reporter import line
+from magmav.view.table import replay_view, to_text
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from random_motions import drawn, judge, summary, wild
@@ -53,6 +75,78 @@ def wrong(finding):
     return off, off / finding.sigma_mg[axes]
 
 
+# ---------------------------------------------------------------- AT-1
+
+
+def test_AT_1a_an_unknown_down_axis_makes_the_heading_of_a_tilted_rover_less_sure():
+    """Flat for a minute, then a ramp of 8 degrees: what Z may be off comes into the level field with the tilt."""
+    records = driven(onto_a_ramp, ROVER, 3, "adaptive", gps=False, seconds=70.0)
+    level, tilted = records[-10], records[-2]
+    assert level.verdict.axes[2] is AxisState.NOT_OBSERVED and level.offsets_mg[2] == STORED_Z
+    assert tilted.pitch_rad > math.radians(6.0) > level.pitch_rad
+    unknown = level.estimate.own_sigma_mg[2] * math.sin(tilted.pitch_rad) / EXPECTED.horizontal_mg
+    assert tilted.heading.sigma_rad > max(1.5 * level.heading.sigma_rad, 0.5 * min(unknown, 1.0))
+    yaw = true_yaw(onto_a_ramp, 70.0, 3, 10)[-1] - DECLINATION_RAD
+    assert abs(math.remainder(tilted.heading.magnetic_rad - yaw, math.tau)) < 3.0 * tilted.heading.sigma_rad
+
+
+def test_AT_1c_what_the_coach_says_all_along_a_drive_never_asks_to_invert_nose_down_or_roll():
+    for motion, kind in ((rover, ROVER), (boat, BOAT)):
+        said = set()
+        for r in driven(motion, kind, 1, "adaptive", gps=False, seconds=60.0)[::30]:
+            said.add(next_step(r.verdict, advise(r.estimate, r.roll_rad, r.pitch_rad, None, kind)))
+            said |= {reason.text for reason in r.verdict.reasons}
+        assert len(said) > 2
+        assert not [text for text in said if re.search("bank|pitch|roll|nose|invert|turn over", text)]
+
+
+# ---------------------------------------------------------------- AT-2a, 2d
+
+
+@pytest.mark.parametrize("where", [HERE, NOWHERE], ids=["position", "none"])
+def test_AT_2a_forty_degrees_of_yaw_are_not_enough_at_any_moment(where):
+    """Never READY, and the reason names the axis and the motion; what is claimed of it all the same is true."""
+    flight = arc()
+    found = run(placed(flight) if where is HERE else flight, channel("adaptive"), where)
+    assert {f.verdict.state for f in found} == {State.LEARNING}
+    last = found[-1]
+    assert {Reason.X_NOT_OBSERVED, Reason.Y_NOT_OBSERVED, Reason.HEADING_UNSURE} & set(last.verdict.reasons)
+    assert next_step(last.verdict, advise(last.estimate, 0.0, 0.0, None, COPTER))
+    off, sigma = np.abs(last.offsets_mg + HARD_IRON_MG), last.sigma_mg
+    assert np.all(off < 3.5 * sigma)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        pytest.param(HERE, id="position"),
+        pytest.param(
+            NOWHERE,
+            id="none",
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="HEADING_UNSURE for want of headings, and the coach says 'bank 15 degrees right' for a down "
+                "axis of 84 mG: X and Y are under 6 mG, so yaw is never advised though only yaw heals the reason",
+            ),
+        ),
+    ],
+)
+def test_AT_2a_the_motion_that_is_missing_is_yaw_and_the_coach_says_so(where):
+    flight = arc()
+    last = run(placed(flight) if where is HERE else flight, channel("adaptive"), where)[-1]
+    assert re.search("yaw|turn", next_step(last.verdict, advise(last.estimate, 0.0, 0.0, None, COPTER)))
+
+
+def test_AT_2d_an_unknown_down_axis_holds_nothing_up_and_is_not_dragged_along_by_the_level_ones():
+    """Level turns, position unknown: X and Y are found, and of Z nothing is claimed."""
+    last = run(yaw_only(60.0), channel("adaptive"), NOWHERE)[-1]
+    assert last.verdict.state is State.READY
+    assert last.verdict.axes == (AxisState.OBSERVED, AxisState.OBSERVED, AxisState.NOT_OBSERVED)
+    off = np.abs(last.offsets_mg + HARD_IRON_MG)
+    assert np.all(off[:2] < 10.0)
+    assert off[2] < 3.0 * last.estimate.own_sigma_mg[2]
+
+
 # ---------------------------------------------------------------- AT-2b
 
 
@@ -63,16 +157,16 @@ def random_motion(t, r):
 
 
 def test_AT_2b_whatever_the_motion_what_is_accepted_is_as_right_as_it_claims(monkeypatch):
-    """AT-2b on 40 wild motions; all 500, through the whole path, are `make soak`'s (benchmarks/random_motions.py)."""
+    """AT-2b on 20 wild motions; all 500, through the whole path, are `make soak`'s (benchmarks/random_motions.py)."""
     monkeypatch.setitem(MOTIONS, "wild", random_motion)
     shares, accepted = [], 0
-    for seed in range(40):
+    for seed in range(20):
         ready = [f for f in learnt(samples("wild", 6000 + seed, seconds=25.0)) if f.verdict.state is State.READY]
         accepted += bool(ready)
         for f in ready[::10]:
             assert wrong(f)[0].max() <= 30.0, seed
         shares += wrong(ready[-1])[1].tolist() if ready else []
-    assert accepted >= 20  # timid it is not
+    assert accepted >= 10  # timid it is not
     assert np.mean(np.array(shares) <= 3.0) >= 0.99, sorted(shares)[-5:]
 
 
@@ -142,12 +236,100 @@ def test_AT_3b_coverage_is_counted_in_body_axes():
     assert 0.03 < ring.coverage < 0.3
 
 
+# ---------------------------------------------------------------- AT-3a, 3d
+
+
+def test_AT_3a_through_the_whole_service_a_strange_field_is_named_within_five_seconds():
+    """|B| over 950 mG from the first sample: hatch magnets. Under 150 mG is test_causes'."""
+    bench = Bench()
+    hatch = np.array([2900.0, -1500.0, 1800.0])
+    records = bench.play(frames(figure_eight, COPTER, 5.0, 3, hz=10, iron_mg=hatch))
+    (cause,) = bench.pipeline.vehicles[1].causes.latest(1)
+    assert cause.code == "MAGNET_NEARBY"
+    assert cause.figure["field_mg"] == pytest.approx(np.linalg.norm(hatch), abs=600.0)
+    assert f"{cause.figure['field_mg']:.0f} mG" in cause.text and "magnet or steel near compass" in cause.text
+    assert not any(r.verdict.state is State.READY for r in records)
+
+
+def words_of(path):
+    """Every string of a module but its docstrings, f-strings in one piece."""
+    tree = ast.parse(path.read_text())
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docs = {id(n.body[0].value) for n in ast.walk(tree) if isinstance(n, documented) and n.body
+            and isinstance(n.body[0], ast.Expr)}  # fmt: skip
+    parts = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+    for n in ast.walk(tree):
+        if isinstance(n, ast.JoinedStr):
+            yield "".join(str(v.value) if isinstance(v, ast.Constant) else "{}" for v in n.values)
+        elif isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in docs | parts:
+            yield n.value
+
+
+def test_AT_3d_every_refusal_has_a_code_and_a_sentence_and_nothing_just_failed():
+    """Whatever failed is named before the word, and why after it; a count may stand for many whys."""
+    numbers = [r.number for r in Reason]
+    assert len(set(numbers)) == len(numbers)
+    for r in Reason:
+        assert re.fullmatch("[A-Z][A-Z_]+", r.name) and len(r.text.split()) >= 3 and "failed" not in r.text
+    package = Path(__file__).parents[1] / "magmav"
+    said = {text for path in package.rglob("*.py") for text in words_of(path) if re.search("failed", text, re.I)}
+    assert all(re.search(r"\w+ failed: \{\}", text) for text in said - {"open failed"}), said
+
+
+# ---------------------------------------------------------------- AT-11
+
+
+BURIED_M, GROUND_MG = 0.8, np.array([140.0, -180.0, 120.0])
+
+
+def climb(t, r):
+    """Twelve seconds on the ground, up to 30 m in fifteen, and figure eights all the way."""
+    begun, since = eased(t - 12.0, 4.0), np.maximum(t - 12.0, 0.0)
+    m = figure_eight(since, r)
+    return Motion(m.roll_rad * begun, m.pitch_rad * begun, m.yaw_rad)
+
+
+def climbing(near_mg=GROUND_MG, seconds=70.0, hz=10):
+    """Frames of it over a dipole in the ground, with heights told."""
+    t = np.arange(int(seconds * hz)) / hz
+    height_m = np.clip((t - 12.0) * 2.0, 0.0, 30.0)
+    dipole = near_mg * ((BURIED_M / (BURIED_M + height_m)) ** 3)[:, None]
+    tell, out = Teller(), []
+    sent = frames(climb, COPTER, seconds, 5, armed=True, gps=False, hz=hz, near_mg=dipole)
+    for i in range(0, len(t), hz // 2):
+        ms = 10_000 + i * 1000 // hz
+        out.append((ms, tell.height(ms, float(height_m[i]))))
+    return sorted(sent + out, key=lambda f: f[0])
+
+
+def test_AT_11a_a_dipole_under_the_pad_is_not_learnt_and_the_rest_of_the_flight_is():
+    """AT-11a through the whole service: steel in the ground, gone at 3 m; at 30 m at most 10 mG off."""
+    bench = Bench()
+    records = bench.play(climbing())
+    low = [r for r in records if r.boot_ns < (10.0 + 12.0 + 1.5) * 1e9]
+    assert low and not any(r.learnt or r.verdict.state is State.READY for r in low)
+    last = records[-1]
+    assert last.verdict.state is State.READY
+    assert np.abs(last.offsets_mg + HARD_IRON_MG).max() <= 10.0
+    assert "GROUND_DISTURBED" in {c.code for c in bench.pipeline.vehicles[1].causes.of(1)}
+
+
+@pytest.mark.parametrize("motion", ["hover turns", "survey"])
+def test_AT_11c_a_whole_session_among_steel_is_never_ready_to_upload(motion):
+    """The field wanders by 80 mG over some seconds, all the time."""
+    r = np.random.default_rng(12)
+    flight = samples(motion, 12, seconds=60.0)
+    steel = np.stack([wander(r, len(flight), 1 / RATE_HZ, 80.0, 3.0) for _ in range(3)], 1)
+    found = learnt([replace(s, mag_b_mg=vec3(s.mag_b_mg + d, "m")) for s, d in zip(flight, steel, strict=True)])
+    assert all(f.verdict.state is not State.READY for f in found)
+
+
 # ---------------------------------------------------------------- AT-12
 
 
 def flown(gps, seconds=30.0):
     """The last record of a copter's figure eights; armed for ten seconds without a word of height, it is aloft."""
-    return Bench().play(frames(figure_eight, COPTER, seconds, 3, armed=True, gps=gps, height_m=30.0))[-1]
+    return Bench().play(frames(figure_eight, COPTER, seconds, 3, armed=True, gps=gps, height_m=30.0, hz=10))[-1]
 
 
 def test_AT_12a_without_a_place_heading_is_magnetic_only_and_true_is_absent_not_zero():
@@ -243,15 +425,181 @@ def test_AT_12d_most_hypotheses_are_gone_after_twenty_seconds():
     assert e._bank is not None and len(e._bank) <= 8
 
 
+# ---------------------------------------------------------------- AT-13
+
+
+def told_course(crab_deg, seconds=40.0, hz=10):
+    """A flight whose GPS speaks of 8 m/s, so many degrees to the right of the nose; None: it stands still."""
+    sent = frames(figure_eight, COPTER, seconds, 3, armed=True, gps=False, hz=hz)
+    yaw, tell, out = true_yaw(figure_eight, seconds, 3, hz), Teller(), []
+    for i in range(0, len(yaw), hz // 5):
+        ms, way = 10_000 + i * 1000 // hz, yaw[i] + math.radians(crab_deg or 0.0)
+        north, east = (0, 0) if crab_deg is None else (int(800 * math.cos(way)), int(800 * math.sin(way)))
+        course = round(math.degrees(way) % 360.0 * 100.0) % 36000
+        out.append((ms, tell(dialect.MAVLink_global_position_int_message(
+            ms, 473977000, 85456000, 518_000, 30_000, north, east, 0, course))))  # fmt: skip
+    return sorted(sent + out, key=lambda f: f[0])
+
+
+def gps_yaw(folder, seconds=40.0, hz=10):
+    """What two antennas would say of that flight, as a reference file: true yaw, half a degree of noise, 5 Hz."""
+    yaw, r = np.degrees(true_yaw(figure_eight, seconds, 3, hz)), np.random.default_rng(8)
+    rows = [f"{10.0 + i / hz},0,0,{(yaw[i] + r.normal(0.0, 0.5)) % 360.0}" for i in range(0, len(yaw), 2)]
+    path = folder / "gps_yaw.csv"
+    path.write_text("boot_time_s,roll_deg,pitch_deg,heading_true_deg\n" + "\n".join(rows) + "\n")
+    return Reference.from_csv(path)
+
+
+def appraised(records, vehicle, reference):
+    log = CompassLog()
+    for r in records:
+        log.add(r, vehicle.calibrations.shaping(1))
+    return describe(log, vehicle, reference, None)
+
+
+@pytest.fixture(scope="module")
+def crabbing(tmp_path_factory):
+    """Records of a flight with 20 degrees of wind angle, its entry in the result, and the name of its reference."""
+    reference, bench = gps_yaw(tmp_path_factory.mktemp("crab")), Bench()
+    records = bench.play(told_course(20.0))
+    return records, appraised(records, bench.pipeline.vehicles[1], reference), reference
+
+
+def test_AT_13a_heading_before_and_after_against_gps_yaw_with_n_mean_and_rms(crabbing):
+    records, entry, reference = crabbing
+    scored = entry["heading"]
+    assert scored["n"] > 200 and scored["n"] + sum(scored["excluded"].values()) == len(records)
+    assert scored["stored_rms_deg"] > 30.0  # hundreds of mG of iron, nothing stored
+    assert abs(scored["bias_deg"]) <= scored["rms_deg"] < 0.1 * scored["stored_rms_deg"]
+    after = [r for r in records if scored["from_s"] <= r.boot_ns / 1e9 <= scored["to_s"] and r.heading.true_valid]
+    yaw = reference.interpolate([r.boot_ns / 1e9 for r in after])
+    off = np.array([math.remainder(r.heading.true_rad - y, math.tau) for r, y in zip(after, yaw[2], strict=True)])
+    off = np.degrees(off[yaw.valid])
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(scored["rms_deg"], rel=0.2)
+    assert np.mean(off) == pytest.approx(scored["bias_deg"], abs=0.2)
+
+
+@pytest.mark.xfail(strict=True, reason="the mean error is given for the corrected heading only, and only in the JSON")
+def test_AT_13a_the_mean_before_is_reported_too_and_in_the_text(crabbing):
+    _, entry, _ = crabbing
+    text = to_text(replay_view({"vehicles": [{"system": 1, "autopilot": 3, "compasses": [entry]}]}))
+    assert len([key for key in entry["heading"] if "bias" in key or "mean" in key]) >= 2
+    assert re.search("mean|bias", text)
+
+
+def test_AT_13a_the_course_over_ground_moves_no_offset_by_a_bit_however_it_crabs(crabbing):
+    """Course is no heading: 20 degrees of wind angle, none, and no course at all teach the same."""
+    last = crabbing[0][-1]
+    for crab_deg in (0.0, None):
+        other = Bench().play(told_course(crab_deg))[-1]
+        assert np.array_equal(other.offsets_mg, last.offsets_mg) and np.array_equal(other.sigma_mg, last.sigma_mg)
+        assert other.heading.true_rad == last.heading.true_rad
+
+
+def test_AT_13b_every_number_and_every_plot_names_its_truth(crabbing, tmp_path):
+    records, entry, reference = crabbing
+    scores = {key: value for key, value in entry.items() if isinstance(value, dict) and "rms_deg" in value}
+    assert {"heading", "heading_offsets_only"} <= set(scores)
+    assert {value["reference"] for value in scores.values()} == {"file gps_yaw.csv"}
+    text = to_text(replay_view({"vehicles": [{"system": 1, "autopilot": 3, "compasses": [entry]}]}))
+    assert "Heading RMS against file gps_yaw.csv:" in text
+    collector = TraceCollector()
+    for r in records:
+        collector.add(r)
+    (trace,) = collector.traces()
+    drawn = trace.against(reference.interpolate(trace.boot_s).yaw_true_rad, 90.0, 1.0, None, None)
+    figure = plot_replay(tmp_path / "p.png", [drawn], "flight", reference.name)
+    blocks = [figure, *figure.findobj(Axes)]
+    said = [" / ".join(part.get_text() for part in block.findobj(Text)) for block in blocks]
+    errors = [text for text in said if "error" in text]
+    assert len(errors) >= 3
+    assert all("file gps_yaw.csv" in text for text in errors), errors
+
+
+# ---------------------------------------------------------------- AT-15, 19, 20
+
+
+@pytest.mark.parametrize("name", ["YAW_180", "PITCH_90"])
+def test_AT_15a_a_compass_at_right_angles_is_not_ready_at_any_moment_and_the_rotation_is_printed(name):
+    bench = Bench()
+    records = bench.play(mounted(MOUNTS[name].T))
+    assert not any(r.verdict.state is State.READY for r in records)
+    assert records[-1].verdict.state is State.REFUSED
+    entry = appraised(records, bench.pipeline.vehicles[1], None)
+    assert name in to_text(replay_view({"vehicles": [{"system": 1, "autopilot": 3, "compasses": [entry]}]}))
+
+
+@pytest.mark.parametrize("degrees", [30.0, -30.0])
+def test_AT_15b_a_compass_turned_by_thirty_degrees_is_said_to_be_and_not_hidden_in_the_offsets(degrees):
+    """AT-15b through the whole service, from the first moment at which it would write."""
+    bench, silent = Bench(), []
+    vehicle, records = None, []
+    for frame in mounted(about(z=degrees).T):
+        for r in bench.play([frame]):
+            vehicle = bench.pipeline.vehicles[1]
+            records.append(r)
+            if r.verdict.state is State.READY and "MOUNTED_CROOKED" not in {c.code for c in vehicle.causes.of(1)}:
+                silent.append(np.abs(r.offsets_mg + HARD_IRON_MG).max())
+    (cause,) = vehicle.causes.of(1)
+    assert cause.code == "MOUNTED_CROOKED"
+    assert cause.figure["yaw_deg"] == pytest.approx(degrees, abs=5.0)
+    last = records[-1]
+    assert last.verdict.state is not State.READY or np.abs(last.offsets_mg + HARD_IRON_MG).max() < 10.0
+    assert max(silent, default=0.0) < 30.0
+
+
+@pytest.fixture(scope="module", params=[0.7, 1.3])
+def scaled(request):
+    """The gain of a compass, the records of a flight with it, and what was found."""
+    bench = Bench()
+    records = bench.play(mounted(request.param * np.eye(3), seed=16))
+    return request.param, records, {c.code: c for c in bench.pipeline.vehicles[1].causes.of(1)}
+
+
+def test_AT_19a_the_service_calls_scale_scale_and_refuses_beyond_a_fifth(scaled):
+    """Within 36 s of flight."""
+    gain, records, causes = scaled
+    cause = causes["SCALE_WRONG"]
+    assert cause.figure["gain"] == pytest.approx(gain, abs=max(4 * cause.figure["sigma"], 0.01))
+    last = records[-1]
+    assert last.verdict.state is State.REFUSED and Reason.SCALE_WRONG in last.verdict.reasons
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="READY before the cause finder's first word at 30 s, with the scale hidden in Z: gain 0.7 from 10.2 s on, "
+    "141 mG off (23 claimed sigmas), gain 1.3 from 29.2 s on, 108 mG off (19 sigmas)",
+)
+def test_AT_19a_scale_is_not_hidden_in_the_offsets_of_anything_that_was_ready(scaled):
+    _, records, _ = scaled
+    ready = [r for r in records if r.verdict.state is State.READY]
+    assert all(np.abs(r.offsets_mg + HARD_IRON_MG).max() <= 30.0 for r in ready)
+
+
+def test_AT_20a_a_weak_horizontal_field_makes_the_heading_as_unsure_as_it_is():
+    """60 mG level instead of 205: the sigma grows in proportion, is honest, and the warning stands."""
+    steep = np.array([60.0, 0.0, 560.0])
+    flight = samples("figure eight", 19, earth_mg=steep)
+    there = replace(HERE, expected=ExpectedField(60.0, 560.0, 0.0))
+    weak = run([replace(s, model_mg=(60.0, 560.0)) for s in flight], channel("adaptive"), there)
+    strong = learnt(samples("figure eight", 19))
+    assert Reason.HORIZONTAL_WEAK in weak[-1].verdict.reasons
+    assert Reason.HORIZONTAL_WEAK not in strong[-1].verdict.reasons
+    sigma = [np.median([f.heading.sigma_rad for f in found[-100:]]) for found in (weak, strong)]
+    assert sigma[0] > 0.7 * EXPECTED.horizontal_mg / 60.0 * sigma[1]
+    yaw = figure_eight(np.arange(len(flight)) / RATE_HZ, np.random.default_rng(19)).yaw_rad
+    off = [math.remainder(f.heading.magnetic_rad - y, math.tau) for f, y in zip(weak[-300:], yaw[-300:], strict=True)]
+    assert np.sqrt(np.mean(np.square(off))) < 2.0 * sigma[0]
+
+
 # ---------------------------------------------------------------- none is missing
 
 NAMED = {
-    1: "abcd", 2: "abcd", 3: "abcd", 11: "abc", 12: "abcd", 15: "ab", 17: "ab", 19: "a", 20: "a",
+    1: "abcd", 2: "abcd", 3: "abcd", 11: "abc", 12: "abcd", 13: "ab", 15: "ab", 17: "ab", 19: "a", 20: "a",
 }  # fmt: skip
 
 
 def test_every_acceptance_test_of_the_estimator_has_a_test_of_its_name():
-    """By the test's name (AT_2a) or its docstring (AT-2a)."""
     sources = "".join(p.read_text() for p in Path(__file__).parent.glob("test_*.py"))
-    tests = set(re.findall(r"def test_AT_?(\d+[a-d])_", sources)) | set(re.findall(r'"""AT-(\d+[a-d])', sources))
+    tests = set(re.findall(r"def test_AT_(\d+[a-d])_", sources))
     assert [f"{n}{x}" for n, of in NAMED.items() for x in of if f"{n}{x}" not in tests] == []

@@ -21,7 +21,7 @@ _EARTH_LEVEL_MG = (_WEAK_HORIZONTAL_MG / 2.0, 450.0)  # horizontally, all that t
 _FROZEN_S = 3.0
 _SLACK = 1.25  # a verdict once reached is kept until a line is crossed by this much: no flicker
 _HEADING_SECTORS = 3
-_APART = 4.0
+_APART, _APART_BLIND = 4.0, 2.2  # sigmas between two opinions; closer where no field model ties either of them down
 _STRANGE_NIS = 5.0  # over the last second: something is going on that no estimate has caught up with
 
 
@@ -134,7 +134,7 @@ def _missing(
     out += [n for n, axis in zip(names, axes, strict=False) if axis is AxisState.NOT_OBSERVED]
     if e.offsets_heading_sigma_rad > limits.heading_sigma_rad * slack or e.sectors < _HEADING_SECTORS:
         out.append(Reason.HEADING_UNSURE)
-    if estimate.apart > _APART * slack:
+    if estimate.apart > (_APART_BLIND if e.expected is None else _APART) * slack:
         out.append(Reason.OPINIONS_DIFFER)
     if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS:
         out.append(Reason.JUST_CHANGED)

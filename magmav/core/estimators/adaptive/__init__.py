@@ -28,7 +28,7 @@ from magmav.core.estimators.adaptive.measurement import equation, smear, soft_ma
 from magmav.core.estimators.adaptive.opinion import doubt, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
-from magmav.core.estimators.adaptive.tuning import MODELS, SOFT_IRON, Tuning
+from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
@@ -293,8 +293,8 @@ class AdaptiveEstimator:
         if stale(second, self._change.since_s):
             return mean, iron_mg2, own_mg2, apart
         much = doubt(apart)
-        if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank, to the second opinion it does not
-            much *= 1.0 + self.tuning.soft_doubt * bank.share(SOFT_IRON) ** 2
+        if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank
+            much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
         motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3  # which it knows nothing of
         weight = np.linalg.inv(iron_mg2 + much * said.covariance_mg2 + motors)
         mean = mean + pulled @ (weight @ off)

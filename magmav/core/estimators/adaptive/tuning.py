@@ -49,9 +49,9 @@ class Tuning:
     adapt_after: int = 5  # blocks
     adapt_s: float = 10.0
     adapt_first_s: float = 2.0
-    sync_s: float = 0.02
+    sync_s: float = 0.03
     tilt_rad: float = math.radians(1.0)
-    tilt_tau_s: float = 15.0
+    tilt_tau_s: float = 10.0
     least_tilt_rad: float = math.radians(1.2)  # RMS per axis: less may be nothing but noise of the attitude
     own_tilt_doubt: float = 3.0  # times what gyro and accelerometer claim of their tilt: the error goes with the motion
     own_tilt_tau_s: float = 3.0
@@ -70,7 +70,7 @@ class Tuning:
     temper: float = 0.25
     forget_s: float = 60.0
     prune_every: int = 8
-    soft_doubt: float = 9.0  # by how much more the second opinion is doubted where all believe in soft iron
+    plain_doubt: float = 9.0  # by how much more the second opinion is doubted where nothing looks like plain iron
     join_apart: float = 3.0  # sigmas between bank and second opinion, for this to compete in the bank
     join_every_s: float = 8.0
     join_behind: float = 2.0  # in log weight
