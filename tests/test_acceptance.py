@@ -157,16 +157,16 @@ def random_motion(t, r):
 
 
 def test_AT_2b_whatever_the_motion_what_is_accepted_is_as_right_as_it_claims(monkeypatch):
-    """AT-2b on 20 wild motions; all 500, through the whole path, are `make soak`'s (benchmarks/random_motions.py)."""
+    """AT-2b on 16 wild motions; all 500, through the whole path, are `make soak`'s (benchmarks/random_motions.py)."""
     monkeypatch.setitem(MOTIONS, "wild", random_motion)
     shares, accepted = [], 0
-    for seed in range(20):
+    for seed in range(16):
         ready = [f for f in learnt(samples("wild", 6000 + seed, seconds=25.0)) if f.verdict.state is State.READY]
         accepted += bool(ready)
         for f in ready[::10]:
             assert wrong(f)[0].max() <= 30.0, seed
         shares += wrong(ready[-1])[1].tolist() if ready else []
-    assert accepted >= 10  # timid it is not
+    assert accepted >= 8  # timid it is not
     assert np.mean(np.array(shares) <= 3.0) >= 0.99, sorted(shares)[-5:]
 
 
@@ -272,7 +272,8 @@ def test_AT_3d_every_refusal_has_a_code_and_a_sentence_and_nothing_just_failed()
     for r in Reason:
         assert re.fullmatch("[A-Z][A-Z_]+", r.name) and len(r.text.split()) >= 3 and "failed" not in r.text
     package = Path(__file__).parents[1] / "magmav"
-    said = {text for path in package.rglob("*.py") for text in words_of(path) if re.search("failed", text, re.I)}
+    paths = [path for path in package.rglob("*.py") if "failed" in path.read_text().lower()]
+    said = {text for path in paths for text in words_of(path) if "failed" in text.lower()}
     assert all(re.search(r"\w+ failed: \{\}", text) for text in said - {"open failed"}), said
 
 
