@@ -21,7 +21,7 @@ def field_day(folder):
     (scenario := folder / "staying.toml").write_text(LEVEL.format(seed=32))
     port, day = free_port(), {}
     link, store = f"udpin:127.0.0.1:{port}", ["--store", folder / "magmav.sqlite", "--json"]
-    with started("sim", scenario, "--to", f"udpout:127.0.0.1:{port}", "--speed", "max"):
+    with started("sim", scenario, "--to", f"udpout:127.0.0.1:{port}", "--speed", "10"):
         with started("run", link, *store) as run:
             day["run"] = until_landed_and_ready(run)
             day["taken"] = magmav("run", link, "--store", folder / "other.sqlite", "--json", "--for", 1)

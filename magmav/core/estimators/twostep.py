@@ -222,6 +222,14 @@ class TwostepEstimator:
 
     def estimate(self, expected: ExpectedField | None) -> Estimate | None:
         """Belief now; None for a compass of two axes, and before three seconds and 20 values."""
+        said = self.opinion(expected)
+        if said is None:
+            return None
+        ago_s = min(self._now_s - self._changed_s, _FOREVER_S)
+        return replace(said, samples=self._samples, changed_ago_s=ago_s)
+
+    def opinion(self, expected: ExpectedField | None) -> Estimate | None:
+        """The same without what changes from sample to sample: counts and ages as they were at the last block."""
         got, x = self._stretch, self._x
         if got is None or x is None or self._axes != 3 or self._samples < _LEAST_SAMPLES:
             return None
@@ -230,8 +238,7 @@ class TwostepEstimator:
         length, sigma = self._length(self._model_mg if expected is None else expected.total_mg)
         if self._said is None or self._said[0] != length:
             self._said = length, self._answer(x, got, length, sigma)
-        ago_s = min(self._now_s - self._changed_s, _FOREVER_S)
-        return replace(self._said[1], samples=self._samples, changed_ago_s=ago_s)
+        return self._said[1]
 
     def __getstate__(self) -> dict[str, Any]:
         """What was said since the last block is made again when asked."""
@@ -292,9 +299,11 @@ def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = 60.0
     what the difference may be, and a distance is never claimed too large for that reason. Of two honest opinions with
     errors of their own, three directions give 3.4 or more in one case of a hundred.
     """
-    variances, ways = np.linalg.eigh(b_mg2)
-    ways = ways[:, variances <= knows_mg**2]
-    if ways.shape[1] == 0:
-        return 0.0
-    off = ways.T @ apart_mg
-    return math.sqrt(max(float(off @ np.linalg.solve(ways.T @ (a_mg2 + b_mg2) @ ways, off)), 0.0))
+    both, off = a_mg2 + b_mg2, apart_mg
+    if float(np.trace(b_mg2)) > knows_mg**2:
+        variances, ways = np.linalg.eigh(b_mg2)
+        ways = ways[:, variances <= knows_mg**2]
+        if ways.shape[1] == 0:
+            return 0.0
+        both, off = ways.T @ both @ ways, ways.T @ apart_mg
+    return math.sqrt(max(float(off @ np.linalg.solve(both, off)), 0.0))

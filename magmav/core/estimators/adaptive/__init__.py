@@ -167,7 +167,7 @@ class AdaptiveEstimator:
     def _compete(self, block: Block) -> None:
         """Where the second opinion is another, let it compete: the bank may have gone astray."""
         bank, second = self._bank, self._second
-        said = None if second is None else second.estimate(None)
+        said = None if second is None else second.opinion(None)
         if bank is None or second is None or said is None or stale(second, self._change.since_s):
             return
         mean, covariance = bank.mixture()
@@ -285,7 +285,7 @@ class AdaptiveEstimator:
         take (3, n) : the iron of a state.  pulled (n, 3) : covariance of state and iron.
         """
         bank, second = self._bank, self._second
-        said = None if second is None else second.estimate(expected)
+        said = None if second is None else second.opinion(expected)
         if bank is None or second is None or said is None:
             return mean, iron_mg2, own_mg2, 0.0
         off = said.hard_iron_b_mg - take @ mean

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from magmav.core.estimators.adaptive.bank import field_covariance
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 
@@ -26,7 +25,8 @@ def without_prior(iron_mg2: Array, cross_mg2: Array, field_mg2: Array, h_mg: flo
     A prior is a measurement, and a measurement can be taken back: P + P C' (R - C P C')^-1 C P, with R^-1 the
     difference of the two priors' information.
     """
-    (a, b), (_, c) = inverse2(*field_covariance(h_mg, v_mg, n)[(0, 0, 1), (0, 1, 1)].tolist())
+    gain2 = n.gain * n.gain
+    (a, b), (_, c) = inverse2(n.model_mg**2 + gain2 * h_mg**2, gain2 * h_mg * v_mg, n.model_mg**2 + gain2 * v_mg**2)
     (a, b), (_, c) = inverse2(a - 1.0 / n.blind_h_mg[1] ** 2, b, c - 1.0 / n.blind_v_mg**2)
     a, b, c = a - float(field_mg2[0, 0]), b - float(field_mg2[0, 1]), c - float(field_mg2[1, 1])
     least = 0.5 * (a + c) - math.hypot(0.5 * (a - c), b)  # eigenvalue
