@@ -566,11 +566,6 @@ def test_AT_19a_the_service_calls_scale_scale_and_refuses_beyond_a_fifth(scaled)
     assert last.verdict.state is State.REFUSED and Reason.SCALE_WRONG in last.verdict.reasons
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="READY before the cause finder's first word at 30 s, with the scale hidden in Z: gain 0.7 from 10.2 s on, "
-    "141 mG off (23 claimed sigmas), gain 1.3 from 29.2 s on, 108 mG off (19 sigmas)",
-)
 def test_AT_19a_scale_is_not_hidden_in_the_offsets_of_anything_that_was_ready(scaled):
     _, records, _ = scaled
     ready = [r for r in records if r.verdict.state is State.READY]

@@ -70,7 +70,8 @@ def test_the_answer_is_the_one_the_pipeline_gives(compared):
     last = replay(told(flight(seconds=60.0)), Settings(), earth_model)["vehicles"][0]["compasses"][0]
     assert got["offsets_mg"] == pytest.approx(last["offsets_mg"], abs=0.5)  # replay's is up to 0.2 s older
     assert got["state"] == records[-1].verdict.state.name
-    assert got["samples"] == last["samples_learnt"] == len(records)
+    assert last["samples_learnt"] == len(records)
+    assert 0 <= len(records) - got["samples"] <= 3  # what comes before it moves teaches the estimator nothing
 
 
 @pytest.mark.parametrize("name", ["kalman", "bullock", "kasa", "taubin"])

@@ -71,7 +71,7 @@ def test_two_axes_cost_sigma_and_never_claim_less_than_three():
     three, two = Bench(), Bench(TWO)
     a, b = three.play(flight(seconds=60.0)), two.play(flight(seconds=60.0))
     cost = b[-1].sigma_mg[:2] / a[-1].sigma_mg[:2]  # the field's length, which three axes show, tells of x and y too
-    assert np.all(cost > 0.8) and np.all(cost < 1.5)
+    assert np.all(cost > 0.8) and np.all(cost < 2.5)  # three axes have a second opinion
     of_three = {r.boot_ns: r.heading.sigma_rad for r in a}  # two axes repeat themselves sometimes: fewer samples
     pairs = [(of_three[r.boot_ns], r.heading.sigma_rad) for r in b[200:]]
     larger = [y >= 0.9 * x for x, y in pairs]

@@ -152,10 +152,12 @@ class _Watch(ChangeWatch):
 
     deaf = False
 
-    def step(self, white: Array, innovation_mg: Array, like: float, disturbance: float, dt_s: float) -> bool:
+    def step(
+        self, white: Array, innovation_mg: Array, like: float, disturbance: float, nis: float, dt_s: float
+    ) -> bool:
         """As ever, but nothing happened while deaf."""
         since_s = self.since_s + dt_s
-        heard = super().step(white, innovation_mg, like, disturbance, dt_s)
+        heard = super().step(white, innovation_mg, like, disturbance, nis, dt_s)
         if heard and self.deaf:
             self.since_s = since_s
         return heard and not self.deaf

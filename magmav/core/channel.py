@@ -30,6 +30,7 @@ _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone, at l
 _UPSET_S = 3.0  # after a sudden change no heading is published: its sigma is that of an answer on its way
 _GUESS_RAD = math.radians(22.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
+_APART_S = 10.0  # a second opinion that doubts itself for a moment has not come to agree
 _FIELD_WEIGHT = 0.04  # five times a second: a memory of five seconds
 
 
@@ -105,6 +106,7 @@ class Channel:
         """Begin again: what was learnt belongs to another stretch of data."""
         self.verdict = gate.NOTHING
         self._estimator = self._make()
+        self._apart, self._apart_ns = 0.0, 0  # sigmas between two opinions, as they lately were
         self._tilt2 = 0.0  # mean square of sin(tilt) where it was learnt
         self._excitation = Excitation()
         self._estimate: Estimate | None = None
@@ -191,6 +193,8 @@ class Channel:
         self._field_mg += weight * (field_mg - self._field_mg)
         upright = math.cos(s.roll_rad) * math.cos(s.pitch_rad)
         self._tilt2 += weight * (1.0 - upright * upright - self._tilt2)
+        since_s = max(s.boot_ns - self._apart_ns, 0) / 1e9
+        self._apart, self._apart_ns = max(e.apart, self._apart * math.exp(-since_s / _APART_S)), s.boot_ns
         level_mg = math.hypot(*level_field(corrected, s.roll_rad, s.pitch_rad))
         self._level_mg += weight * (level_mg - self._level_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
@@ -223,6 +227,7 @@ class Channel:
             offsets_heading_sigma_rad=offsets_sd,
             field_mg=self._field_mg,
             level_mg=self._level_mg,
+            apart=self._apart,
             left_mg=self._left(e, c, sigma_mg),
             steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
             sectors=self._excitation.sectors,

@@ -55,6 +55,7 @@ class Evidence:
     assumed: bool
     parameters_changed: bool
     grounded: bool  # a flying vehicle that has not flown yet, and nobody said that the bench will do
+    apart: float = 0.0  # sigmas between two opinions, as they lately were
     left_mg: float = 0.0  # level field that a down axis not written leaves wrong, at the tilt flown
     axes: int = 3  # 2: the third component of the field comes from the dip, or is missing without a position
 
@@ -134,7 +135,7 @@ def _missing(
     out += [n for n, axis in zip(names, axes, strict=False) if axis is AxisState.NOT_OBSERVED]
     if e.offsets_heading_sigma_rad > limits.heading_sigma_rad * slack or e.sectors < _HEADING_SECTORS:
         out.append(Reason.HEADING_UNSURE)
-    if estimate.apart > (_APART_BLIND if e.expected is None else _APART) * slack:
+    if e.apart > (_APART_BLIND if e.expected is None else _APART) * slack:
         out.append(Reason.OPINIONS_DIFFER)
     if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS:
         out.append(Reason.JUST_CHANGED)

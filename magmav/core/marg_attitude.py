@@ -227,7 +227,7 @@ class MargAttitude:
         down_b = -(marg.matrix(self._q).T @ self._force_n) / strength
         trust = math.exp(-(((strength / _G - 1.0) / _WIDTH) ** 2))
         E = _DOWN_N + self._force_n / strength
-        self._doubt.step((trust * float(E[0]), trust * float(E[1])), self.rate_b_rads, dt)
+        self._doubt.step((float(E[0]), float(E[1])), trust, self.rate_b_rads, dt)
         turn = self._turn(self._q, marg.row_jacobian(self._q, down_b), E, trust * (1.0 - math.exp(-dt / _TILT_TAU_S)))
         turn[2] = 0.0
         back = marg.turned(turn)

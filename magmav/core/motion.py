@@ -209,8 +209,8 @@ class _OwnTilt:
             x, y, z = 0.5 * (self.rate_b_rads + r.rate_b_rads) * dt
             moved = self._down_b - cross_matrix(x, y, z) @ self._down_b
             trust = math.exp(-(((strength - _G) / (0.1 * _G)) ** 2))
-            pull = matrix(of_attitude(roll, pitch, self._yaw_rad)).T @ (trust * (down - moved))
-            self._doubt.step((float(pull[0]), float(pull[1])), self.rate_b_rads, dt)
+            pull = matrix(of_attitude(roll, pitch, self._yaw_rad)).T @ (down - moved)
+            self._doubt.step((float(pull[0]), float(pull[1])), trust, self.rate_b_rads, dt)
             moved += trust * (1.0 - math.exp(-dt / _TILT_TAU_S)) * (down - moved)
             self._down_b = moved / np.linalg.norm(moved)
         self._boot_ns, self.rate_b_rads = r.boot_ns, r.rate_b_rads

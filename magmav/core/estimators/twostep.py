@@ -32,6 +32,8 @@ _LEAST_SAMPLES, _LEAST_BLOCKS = 20, 3
 _ROUGH, _SETTLED, _LOOK_EVERY = 6, 30, 8  # blocks: the start may be far away until, every second until, twins sought
 _SURE_MG = 10.0  # who knows the centre so well has no twin
 _SAME_MG = 0.1  # lengths
+KNOWS_MG = 60.0
+"""One sigma: who is less sure of a direction than this cannot contradict there."""
 _FOREVER_S = 1e9
 
 
@@ -289,7 +291,7 @@ class TwostepEstimator:
         return np.outer(u, u) * size2
 
 
-def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = 60.0) -> float:
+def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = KNOWS_MG) -> float:
     """By how many sigmas two opinions on one iron are apart, in the direction in which it is most.
 
     apart_mg (n,) : their difference.  a_mg2, b_mg2 (n, n) : their covariances, b's that of the second opinion.

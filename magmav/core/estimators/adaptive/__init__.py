@@ -15,6 +15,7 @@ tuning       every chosen number
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
-from magmav.core.estimators.adaptive.opinion import doubt, own_covariance, stale
+from magmav.core.estimators.adaptive.opinion import doubt, known, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
@@ -82,8 +83,6 @@ class AdaptiveEstimator:
         n, gathering = self.tuning, self._gathering
         if self._by_hand and s.learn and not s.by_hand and self._second is not None:
             self._second = TwostepEstimator()  # what stood about it in the hand does not fly along
-        if self._second is not None:
-            self._second.step(s)
         if len(gathering) and (s.gap or not s.learn or not gathering.fits(s)):
             self._learn()
         self._own_yaw_rad += s.yaw_step_rad
@@ -99,6 +98,8 @@ class AdaptiveEstimator:
         else:
             walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
             gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
+        if self._second is not None:
+            self._second.step(replace(s, learn=False) if still else s)
         self._lost = self._lost or s.gap
         if not s.learn or still or self._wild.step(z, rate * dt):
             return
@@ -214,15 +215,15 @@ class AdaptiveEstimator:
         mean = nu.sum(1) / size
         variance = np.einsum("kiaja->ka", apart) / size**2
         white = between(mean / np.sqrt(variance), -4.0, 4.0)
+        strangeness = float(np.minimum(strange[best], _STRANGEST).mean()) / k
+        self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         if self._blocks > n.adapt_after:
             adapt(bank, nu, white, bank.common_mg2[:, None] / variance, block.dt_s, n)
             push = bank.x[best, at.D] / bank.disturbance_mg[best]
             like = float(bank.product[best] / max(bank.square[best], 0.1))
-            changed = self._change.step(white[best], mean[best], like, float(push @ push), block.dt_s)
+            changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
-        strangeness = float(np.minimum(strange[best], _STRANGEST).mean()) / k
-        self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
@@ -264,7 +265,7 @@ class AdaptiveEstimator:
             own_sigma_mg=vec3(np.sqrt(np.diag(own_mg2)), "sigma"),
             horizontal_mg=float(mean[at.H]),
             down_mg=float(mean[at.V]),
-            residual_mg=math.sqrt(self._residual_mg2),
+            residual_mg=math.sqrt(self._residual_mg2 + self._bank.structure_mg2()),
             step_nis=self._nis,
             samples=self._samples,
             changed_ago_s=self._change.since_s,
@@ -296,8 +297,8 @@ class AdaptiveEstimator:
         if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
         motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3  # which it knows nothing of
-        weight = np.linalg.inv(iron_mg2 + much * said.covariance_mg2 + motors)
+        weight = np.linalg.inv(iron_mg2 + much * known(said.covariance_mg2) + motors)
         mean = mean + pulled @ (weight @ off)
         iron_mg2 = iron_mg2 - iron_mg2 @ weight @ iron_mg2
-        own_mg2 = own_mg2 - own_mg2 @ np.linalg.solve(own_mg2 + much * own_covariance(said) + motors, own_mg2)
+        own_mg2 = own_mg2 - own_mg2 @ np.linalg.solve(own_mg2 + much * known(own_covariance(said)) + motors, own_mg2)
         return mean, symmetric(iron_mg2), symmetric(own_mg2), apart

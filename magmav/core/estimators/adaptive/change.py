@@ -27,8 +27,12 @@ class ChangeWatch:
         self._seen = 0.0  # samples behind the mean, as far as it remembers
         self.since_s = 1e9  # the last change
 
-    def step(self, white: Array, innovation_mg: Array, like: float, disturbance: float, dt_s: float) -> bool:
+    def step(
+        self, white: Array, innovation_mg: Array, like: float, disturbance: float, nis: float, dt_s: float
+    ) -> bool:
         """Take the best hypothesis' innovation, whitened and plain, (k,), and |d|^2 / sigma^2 of its disturbance.
+
+        nis : mean normalised square of single readings over the last second, per axis.
 
         like : correlation of neighbouring innovations; where they are alike anyway, fewer of them count.
         True when the iron must have changed.
@@ -46,7 +50,7 @@ class ChangeWatch:
             return False
         alike = min(max(self._alike, 0.0), 0.9)
         leaning = float(self._mean @ self._mean) * self._seen * (1.0 - alike) / (1.0 + alike)
-        if leaning < n.change_chi2 and disturbance < n.change_disturbance:
+        if leaning < n.change_chi2 and disturbance < n.change_disturbance and nis < n.change_nis:
             return False
         self.since_s = self._seen = 0.0
         self._mean = np.zeros(3)

@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.twostep import TwostepEstimator
+from magmav.core.estimators.twostep import KNOWS_MG, TwostepEstimator
 from magmav.core.types import Estimate
 
 _APART = 1.5  # sigmas between the two from which on the second counts less
+_NOTHING_MG2 = 1e8
 _SINCE_S = 2.0  # it must have begun its stretch of data no longer than this before the last change of the iron
 
 
@@ -25,6 +26,18 @@ def stale(second: TwostepEstimator, changed_ago_s: float) -> bool:
 def doubt(apart: float) -> float:
     """By what the second's variance is multiplied when the two are so many sigmas apart."""
     return max(1.0, apart / _APART) ** 4
+
+
+def known(iron_mg2: Array) -> Array:
+    """The covariance (3, 3) with directions in which it knows too little to be contradicted left out altogether.
+
+    A sphere seen from a point fits anywhere along the line of sight: there even a wide claim is no claim.
+    """
+    if float(np.trace(iron_mg2)) <= KNOWS_MG**2:
+        return iron_mg2
+    variances, ways = np.linalg.eigh(iron_mg2)
+    out: Array = (ways * np.where(variances > KNOWS_MG**2, _NOTHING_MG2, variances)) @ ways.T
+    return out
 
 
 def own_covariance(second: Estimate) -> Array:
