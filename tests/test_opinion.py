@@ -72,7 +72,7 @@ def two(seed, apart):
     mean, p = r.normal(0.0, 100.0, at.SIZE), covariance(r, at.SIZE, 3.0)
     take = np.zeros((3, at.SIZE))
     take[:, at.B], take[:, at.K] = np.eye(3), r.uniform(-0.5, 0.5) * np.eye(3)
-    theirs, off = covariance(r, 3, 8.0), r.normal(0.0, 1.0, 3)
+    theirs, off = covariance(r, 3, 2.0), r.normal(0.0, 1.0, 3)
     iron = take @ p @ take.T
     off *= apart / distance(off, iron, theirs)
     return mean, p, take, theirs, take @ mean + off

@@ -68,6 +68,7 @@ class AdaptiveEstimator:
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
+        self._structure_mg2 = 0.0  # of what readings in a row share, and nothing explains
         self._nis = 1.0
         self._joined_ago_s = 0.0
         self._axes = 3
@@ -224,6 +225,7 @@ class AdaptiveEstimator:
             changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
+        self._structure_mg2 = float(bank.common_mg2[best])
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
@@ -265,7 +267,7 @@ class AdaptiveEstimator:
             own_sigma_mg=vec3(np.sqrt(np.diag(own_mg2)), "sigma"),
             horizontal_mg=float(mean[at.H]),
             down_mg=float(mean[at.V]),
-            residual_mg=math.sqrt(self._residual_mg2 + self._bank.structure_mg2()),
+            residual_mg=math.sqrt(self._residual_mg2 + self._structure_mg2),
             step_nis=self._nis,
             samples=self._samples,
             changed_ago_s=self._change.since_s,

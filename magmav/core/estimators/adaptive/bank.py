@@ -150,10 +150,6 @@ class Bank:
         w = np.exp(self.log_weight - self.log_weight.max())
         return np.asarray(w / w.sum())
 
-    def structure_mg2(self) -> float:
-        """Variance per axis of what readings in a row have in common and the best hypothesis cannot explain."""
-        return float(self.common_mg2[int(np.argmax(self.log_weight))])
-
     def share(self, model: Model) -> float:
         """How much one model is believed."""
         return float(self.weights()[self.model == MODELS.index(model)].sum())
