@@ -407,3 +407,27 @@ def test_replay_tells_it_where_it_is_asked_for(heard):
 def test_all_of_the_flight_cannot_be_known_and_frozen(capsys, tmp_path):
     assert main(["replay", str(tmp_path / "x.tlog"), "--after-flight", "--learn-for", "30"]) == 2
     assert "--learn-for" in capsys.readouterr().err
+
+
+def test_a_rest_in_mid_flight_with_a_biased_gyro_turns_neither_way_astray():
+    """What a gyro shows while nothing moves is its bias: alpha turns by it, backwards the other way."""
+    rng = np.random.default_rng(3)
+    flight = flown("figure eight", 13)
+    first, last = flight[:300], flight[300:]
+    bias, dt = vec3((0.0, 0.0, math.radians(0.5)), "rate"), first[-1].dt_s
+    still = first[-1]
+    rest = []
+    for i in range(round(40.0 / dt)):
+        rest.append(
+            replace(
+                still,
+                boot_ns=still.boot_ns + round((i + 1) * dt * 1e9),
+                mag_b_mg=vec3(still.mag_b_mg + rng.normal(0.0, 1.0, 3), "mag"),
+                rate_b_rads=bias,
+                yaw_step_rad=0.0,
+                throttle=None,
+            )
+        )
+    known = after_flight([*first, *rest, *[replace(s, boot_ns=s.boot_ns + 40_000_000_000) for s in last]])
+    assert not known.changes_ns
+    assert np.all(np.abs(irons(known) - HARD_IRON_MG) < 4.0 * sigmas(known) + 2.0)

@@ -228,6 +228,7 @@ class _Pass(AdaptiveEstimator):
         own_rad = None if s.tilt_from == "ATTITUDE" else s.own_tilt_rad
         bank, down_b = noted(self._bank), s.body_from_own[:, 2]
         turn_rad2 = waiting._turn_rad2 + ((1.0 if own_rad is None else 4.0) * n.turn_walk_rad) ** 2 * s.dt_s
+        bank.x[:, at.ALPHA] += waiting._turned_rad
         advance(bank, waiting._dt_s + s.dt_s, waiting._down_s + s.dt_s * down_b, turn_rad2, own_rad, n)
         return bank, not (s.gap or self._lost)
 
@@ -262,6 +263,7 @@ class _BothWays:
         self._run_forward(samples)
         deaf = (math.inf if elder_ns is None else elder_ns, math.inf)
         self.backward = _Pass(tuning, deaf, self._direction())
+        self.backward._way = -1.0
         if self.before:
             end_ns = max(self.before)
             self._run_backward([s for s in samples if s.boot_ns <= end_ns])

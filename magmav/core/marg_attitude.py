@@ -211,6 +211,7 @@ class MargAttitude:
     def _begin(self, roll_rad: float, pitch_rad: float) -> None:
         self._q = marg.from_matrix(body_from_earth(roll_rad, pitch_rad, self._yaw_rad).T)
         self._epoch += 2
+        self._doubt = TiltDoubt(_TILT_TAU_S, 0.0)
 
     def _predict(self, r: InertialReading, dt: float) -> None:
         """Turn by the mean of two rates; where their axis moves, by the second term of its coning series as well."""

@@ -203,6 +203,7 @@ class _OwnTilt:
         if self._boot_ns is None or dt > 1.0:
             self._down_b = down
             self._epoch += 2
+            self._doubt = TiltDoubt(_TILT_TAU_S, 0.03)
         else:
             roll, pitch = self._tilt()
             self._yaw_rad += euler_rates(roll, pitch, 0.5 * (self.rate_b_rads + r.rate_b_rads))[2] * dt

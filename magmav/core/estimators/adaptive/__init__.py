@@ -49,6 +49,8 @@ _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 class AdaptiveEstimator:
     """One compass's bank."""
 
+    _way = 1.0  # -1 where time runs backwards
+
     def __init__(self, tuning: Tuning | None = None, second: bool = True) -> None:
         """second : is a second opinion heard as well?"""
         self.tuning = tuning or Tuning()
@@ -95,7 +97,7 @@ class AdaptiveEstimator:
         about_down, rate = float(s.rate_b_rads @ down_b) * dt, math.hypot(*s.rate_b_rads.tolist())
         still = s.learn and self._still.step(z, rate, dt) and not len(gathering)
         if still:
-            gathering.rests(dt, about_down)
+            gathering.rests(dt, self._way * about_down)
         else:
             walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
             gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
@@ -173,7 +175,11 @@ class AdaptiveEstimator:
         if bank is None or second is None or said is None or stale(second, self._change.since_s):
             return
         mean, covariance = bank.mixture()
-        apart = distance(mean[at.B] - said.hard_iron_b_mg, covariance[at.B, at.B], said.covariance_mg2)
+        take = self._take()
+        motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3
+        apart = distance(
+            take @ mean - said.hard_iron_b_mg, take @ covariance @ take.T, known(said.covariance_mg2) + motors
+        )
         if apart > self.tuning.join_apart:
             self._joined_ago_s = 0.0
             bank.join(
@@ -225,6 +231,8 @@ class AdaptiveEstimator:
             changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
+        else:
+            self._change.since_s += block.dt_s
         self._structure_mg2 = float(bank.common_mg2[best])
         left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
@@ -248,8 +256,7 @@ class AdaptiveEstimator:
         if self._bank is None or self._samples < 10:
             return None
         mean, covariance = self._bank.mixture()
-        take = np.zeros((3, at.SIZE))  # iron at mean throttle
-        take[:, at.B], take[:, at.K] = _EYE3, self._drive * self._inverse
+        take = self._take()
         pulled = covariance @ take.T
         iron_mg2 = own_mg2 = take @ pulled
         if self._model_mg is not None:
@@ -258,7 +265,9 @@ class AdaptiveEstimator:
         if self._tilting.rms_rad < self.tuning.least_tilt_rad:  # it may be the attitude's own noise that tilts
             unknown = _DOWN * self.tuning.blind_v_mg**2
             own_mg2 = own_mg2 + unknown
-            iron_mg2 = iron_mg2 if self._model_mg is not None else iron_mg2 + unknown
+            if self._model_mg is None:
+                iron_mg2 = iron_mg2 + unknown
+                pulled[at.B] += unknown
         mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
         soft = _EYE3 + soft_matrix(mean[at.S])
         return Estimate(
@@ -279,6 +288,12 @@ class AdaptiveEstimator:
             floor_mg=_FLOOR_MG,
             apart=apart,
         )
+
+    def _take(self) -> Array:
+        """What makes of a state the iron at mean throttle, (3, n)."""
+        take = np.zeros((3, at.SIZE))
+        take[:, at.B], take[:, at.K] = _EYE3, self._drive * self._inverse
+        return take
 
     def _joined(
         self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None

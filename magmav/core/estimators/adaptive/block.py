@@ -13,7 +13,7 @@ import numpy as np
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.types import Sample, Shaping
 
-_EYE3 = np.eye(3)
+_REST_RAD = 0.02  # what stood still may have turned: the field would hardly show less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +63,7 @@ class Gathering:
         self._dt_s = 0.0
         self._down_s: Array = np.zeros(3)
         self._turn_rad2 = self._turned_rad = 0.0
+        self._rested = False
         self._first_s = 0.0
 
     def __len__(self) -> int:
@@ -85,6 +86,8 @@ class Gathering:
 
     def rests(self, dt_s: float, turned_rad: float) -> None:
         """Time goes by and nothing turns but, by a gyro's error, the own frame about its down."""
+        if not self._rested:
+            self._rested, self._turn_rad2 = True, self._turn_rad2 + _REST_RAD**2
         self._dt_s += dt_s
         self._turned_rad += turned_rad
 

@@ -54,6 +54,7 @@ class Tuning:
     tilt_tau_s: float = 10.0
     least_tilt_rad: float = math.radians(1.2)  # RMS per axis: less may be nothing but noise of the attitude
     own_tilt_doubt: float = 3.0  # times what gyro and accelerometer claim of their tilt: the error goes with the motion
+    own_tilt_most_rad: float = math.radians(30.0)  # beyond it the equation is no turn any more
     own_tilt_tau_s: float = 3.0
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
