@@ -18,6 +18,7 @@ from magmav.core.after_flight import AfterFlight, after_flight, backwards
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.bank import Bank
+from magmav.core.estimators.adaptive.block import Gathering
 from magmav.core.estimators.adaptive.tuning import MODELS, Tuning
 from magmav.core.rotation import TAU, body_from_earth
 from magmav.core.two_filter import SHARED, product
@@ -409,13 +410,20 @@ def test_all_of_the_flight_cannot_be_known_and_frozen(capsys, tmp_path):
     assert "--learn-for" in capsys.readouterr().err
 
 
-def test_a_rest_in_mid_flight_with_a_biased_gyro_turns_neither_way_astray():
+def test_a_rest_in_mid_flight_with_a_biased_gyro_turns_neither_way_astray(monkeypatch):
     """What a gyro shows while nothing moves is its bias: alpha turns by it, backwards the other way."""
+    turns, rests = [], Gathering.rests
+
+    def counted(self, dt_s, turned_rad):
+        turns.append(turned_rad)
+        rests(self, dt_s, turned_rad)
+
+    monkeypatch.setattr(Gathering, "rests", counted)
     rng = np.random.default_rng(3)
     flight = flown("figure eight", 13)
     first, last = flight[:300], flight[300:]
-    bias, dt = vec3((0.0, 0.0, math.radians(0.5)), "rate"), first[-1].dt_s
-    still = first[-1]
+    still, dt, turn_rads = first[-1], first[-1].dt_s, math.radians(0.5)
+    bias = vec3(turn_rads * body_from_earth(still.roll_rad, still.pitch_rad, 0.0)[:, 2], "rate")
     rest = []
     for i in range(round(40.0 / dt)):
         rest.append(
@@ -424,10 +432,13 @@ def test_a_rest_in_mid_flight_with_a_biased_gyro_turns_neither_way_astray():
                 boot_ns=still.boot_ns + round((i + 1) * dt * 1e9),
                 mag_b_mg=vec3(still.mag_b_mg + rng.normal(0.0, 1.0, 3), "mag"),
                 rate_b_rads=bias,
-                yaw_step_rad=0.0,
+                yaw_step_rad=turn_rads * dt,
+                body_from_own=None,
                 throttle=None,
             )
         )
     known = after_flight([*first, *rest, *[replace(s, boot_ns=s.boot_ns + 40_000_000_000) for s in last]])
+    forward, backward = sum(t for t in turns if t > 0.0), sum(t for t in turns if t < 0.0)
+    assert forward > math.radians(10.0) and backward == pytest.approx(-forward, rel=0.1)
     assert not known.changes_ns
     assert np.all(np.abs(irons(known) - HARD_IRON_MG) < 4.0 * sigmas(known) + 2.0)
