@@ -1,5 +1,6 @@
 """A flight as bytes: what a scripted ArduPilot vehicle would send, made from honest_flight's truth."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -20,6 +21,22 @@ STORED = {"COMPASS_DEV_ID": 97539.0, "COMPASS_MOTCT": 0.0, "COMPASS_SCALE": 0.0}
     f"COMPASS_{group}_{axis}": float(group == "DIA") for group in ("OFS", "DIA", "ODI", "MOT") for axis in "XYZ"
 }
 Frame = tuple[int, bytes]  # boot time in ms, and what was sent then
+
+
+class Frames:
+    """A link that yields these frames a millisecond apart and ends."""
+
+    name, datagrams, unix_offset_ns = "frames", True, 1_790_000_000 * 10**9
+
+    def __init__(self, frames):
+        self.frames, self.counts = list(frames), Counter()
+
+    def packets(self):
+        for i, (_, data) in enumerate(self.frames):
+            yield Packet(5 * 10**9 + i * 10**6, data, "memory")
+
+    def close(self):
+        pass
 
 
 def earth_model(lat_deg: float, lon_deg: float, alt_m: float, unix_ns: int) -> EarthField:

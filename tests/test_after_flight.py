@@ -2,13 +2,12 @@
 
 import itertools
 import math
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from honest_flight import EXPECTED, MOTIONS, RATE_HZ, samples
-from memory_flight import earth_model, flight
+from memory_flight import Frames, earth_model, flight
 from synthetic_flight import HARD_IRON_MG
 
 from magmav.afterwards import Afterwards
@@ -24,7 +23,6 @@ from magmav.core.rotation import TAU, body_from_earth
 from magmav.core.two_filter import SHARED, product
 from magmav.core.types import Estimate, mat3, vec3
 from magmav.hearing import LinkRecording
-from magmav.link import Packet
 from magmav.recording import replay
 from magmav.settings import Settings
 from magmav.view.compare import compare_view
@@ -351,22 +349,6 @@ def test_models_are_weighed_by_both_sides():
 
 
 # ---------------------------------------------------------------- where it is shown
-
-
-class Frames:
-    """A link that yields these frames a millisecond apart and ends."""
-
-    name, datagrams, unix_offset_ns = "frames", True, 1_790_000_000 * 10**9
-
-    def __init__(self, frames):
-        self.frames, self.counts = list(frames), Counter()
-
-    def packets(self):
-        for i, (_, data) in enumerate(self.frames):
-            yield Packet(5 * 10**9 + i * 10**6, data, "memory")
-
-    def close(self):
-        pass
 
 
 @pytest.fixture(scope="module")

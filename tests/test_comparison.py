@@ -2,17 +2,15 @@
 
 import itertools
 import json
-from collections import Counter
 
 import numpy as np
 import pytest
-from memory_flight import HZ, Bench, earth_model, flight
+from memory_flight import HZ, Bench, Frames, earth_model, flight
 from synthetic_flight import HARD_IRON_MG
 
 from magmav.comparison import BOTH_WAYS, METHODS, Tape, compare
 from magmav.core.estimators import ESTIMATORS
 from magmav.hearing import LinkRecording
-from magmav.link import Packet
 from magmav.pipeline import Pipeline
 from magmav.recording import NothingToLearnFrom, play, replay
 from magmav.settings import Settings
@@ -20,22 +18,6 @@ from magmav.view.compare import compare_view
 from magmav.view.table import to_text
 
 UNIX_NS = 1_790_000_000 * 10**9
-
-
-class Frames:
-    """A link that yields these frames a millisecond apart and ends."""
-
-    name, datagrams, unix_offset_ns = "frames", True, UNIX_NS
-
-    def __init__(self, frames):
-        self.frames, self.counts = list(frames), Counter()
-
-    def packets(self):
-        for i, (_, data) in enumerate(self.frames):
-            yield Packet(5 * 10**9 + i * 10**6, data, "memory")
-
-    def close(self):
-        pass
 
 
 def told(frames):

@@ -175,11 +175,8 @@ class AdaptiveEstimator:
         if bank is None or second is None or said is None or stale(second, self._change.since_s):
             return
         mean, covariance = bank.mixture()
-        take = self._take()
-        motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3
-        apart = distance(
-            take @ mean - said.hard_iron_b_mg, take @ covariance @ take.T, known(said.covariance_mg2) + motors
-        )
+        take, theirs_mg2 = self._take(), known(said.covariance_mg2) + self._motors_mg2(mean)
+        apart = distance(take @ mean - said.hard_iron_b_mg, take @ covariance @ take.T, theirs_mg2)
         if apart > self.tuning.join_apart:
             self._joined_ago_s = 0.0
             bank.join(
@@ -295,6 +292,10 @@ class AdaptiveEstimator:
         take[:, at.B], take[:, at.K] = _EYE3, self._drive * self._inverse
         return take
 
+    def _motors_mg2(self, mean: Array) -> Array:
+        """Variance of the motors' field, of which the second opinion knows nothing, (3, 3)."""
+        return self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3
+
     def _joined(
         self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None
     ) -> tuple[Array, Array, Array, float]:
@@ -313,7 +314,7 @@ class AdaptiveEstimator:
         much = doubt(apart)
         if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
-        motors = self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3  # which it knows nothing of
+        motors = self._motors_mg2(mean)
         weight = np.linalg.inv(iron_mg2 + much * known(said.covariance_mg2) + motors)
         mean = mean + pulled @ (weight @ off)
         iron_mg2 = iron_mg2 - iron_mg2 @ weight @ iron_mg2
