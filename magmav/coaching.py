@@ -21,8 +21,9 @@ def advice_for(record: Record, vehicle: Vehicle | None) -> str:
     kind = None if vehicle is None else vehicle.phase.kind
     limit_mg = 10.0 if vehicle is None else vehicle.settings.gate.axis_sigma_mg
     heading = record.heading.magnetic_rad if record.heading.valid else None
-    advice = advise(record.estimate, record.roll_rad, record.pitch_rad, heading, kind, limit_mg)
-    return next_step(record.verdict, advice)
+    verdict = record.verdict
+    advice = advise(record.estimate, record.roll_rad, record.pitch_rad, heading, kind, limit_mg, verdict.reasons)
+    return next_step(verdict, advice)
 
 
 class Coaching:

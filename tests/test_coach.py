@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_flight import HARD_IRON_MG, turn
 
-from magmav.core import coach
+from magmav.core import coach, gate
 from magmav.core.coach import LONGEST, advise, attitudes, motions, next_step
 from magmav.core.estimators.kalman import KalmanEstimator
 from magmav.core.types import (
@@ -81,6 +81,40 @@ def test_it_asks_for_the_axis_that_is_missing():
 def test_already_banked_right_it_asks_for_the_left():
     assert advise(estimate((4, 4, 40)), math.radians(12), 0.0, None, COPTER) == "bank 15 degrees left"
     assert advise(estimate((4, 4, 40)), math.radians(-12), 0.0, None, COPTER) == "bank 15 degrees right"
+
+
+@pytest.mark.parametrize("reason", [Reason.HEADING_UNSURE, Reason.X_NOT_OBSERVED, Reason.Y_NOT_OBSERVED])
+@pytest.mark.parametrize(("kind", "word"), [(COPTER, "yaw"), (ROVER, "yaw"), (None, "yaw"), (PLANE, "turn|eight")])
+def test_the_down_axis_waits_until_the_level_ones_and_the_headings_are_there(reason, kind, word):
+    """Few headings: the level axes claim 6 mG, nothing is known of the third, and only turning heals the reason."""
+    few = estimate((6, 5, 200))
+    assert re.search(word, advise(few, 0.0, 0.0, None, kind, reasons=(reason, Reason.Z_NOT_OBSERVED)))
+    assert re.search(word, advise(estimate((40, 30, 200)), 0.0, 0.0, None, kind, reasons=(reason,)))
+    only_down = advise(few, 0.0, 0.0, None, kind, reasons=(Reason.Z_NOT_OBSERVED, Reason.NO_POSITION))
+    assert only_down == advise(few, 0.0, 0.0, None, kind)
+    assert not re.search("yaw", only_down)
+
+
+@settings(max_examples=40, deadline=None)
+@given(sigmas, angles, angles, st.sampled_from(KINDS))
+def test_where_headings_are_missing_no_other_motion_teaches_the_worse_level_axis_more(sigma, roll, pitch, kind):
+    e = estimate(sigma, turn(1, 0.2))
+    text = advise(e, roll, pitch, None, kind, reasons=(Reason.HEADING_UNSURE,))
+    left = {m.text: coach.sigma_after(m, e.covariance_mg2, roll, pitch)[:2] for m in motions(kind)}
+    own = np.sqrt(np.diag(e.covariance_mg2))[:2]
+    helped = [i for i in (0, 1) if min(v[i] for v in left.values()) < 0.9 * own[i]]
+    if not helped:
+        assert text == ""
+        return
+    worst = max(helped, key=lambda i: gate.floored(e)[i])
+    assert left[text][worst] <= 1.01 * min(v[worst] for v in left.values())
+
+
+def test_in_a_weak_field_turning_goes_on_under_the_line_of_an_axis():
+    """9 mG are under the line, and 8.6 degrees of heading where only 60 mG are level: the coach is not silent."""
+    e = replace(estimate((9, 9, 4)), horizontal_mg=60.0)
+    assert advise(e, 0.0, 0.0, None, COPTER) == ""
+    assert advise(e, 0.0, 0.0, None, COPTER, reasons=(Reason.HEADING_UNSURE,)) == "yaw right 180 degrees"
 
 
 @settings(max_examples=40, deadline=None)

@@ -21,8 +21,11 @@ COMPASS = {
         "reference": "file truth.csv",
         "rms_deg": 3.21,
         "p95_deg": 6.54,
+        "bias_deg": -0.75,
         "uncalibrated_rms_deg": 96.78,
+        "uncalibrated_bias_deg": 12.25,
         "stored_rms_deg": 41.5,
+        "stored_bias_deg": 8.5,
         "sigma_deg": 2.5,
         "n": 18359,
         "from_s": 220.0,
@@ -63,6 +66,7 @@ def test_a_recordings_table_says_what_the_json_says():
         "Heading RMS against file truth.csv:",
         "uncalibrated 96.78, as stored 41.50 → corrected 3.21 deg (95 % within 6.54,",
         " within 6.54, one sigma claimed: 2.50)",
+        "mean error: uncalibrated +12.25, as stored +8.50 → corrected -0.75 deg",
         "with an upload of offsets alone: 4.32 deg",
         "over 18359 samples, 220 to 588 s of boot time; left out: disarmed 123",
         "The autopilot holds: COMPASS_OFS2_X 12.5, COMPASS_OFS2_Y -3",
@@ -88,6 +92,8 @@ def test_single_unknown_numbers_do_not_hide_the_known_ones():
     text = text_of(changed(offsets_mg=[1.0, None, 3.0], sigma_mg=[0.5, None, 0.5]))
     (line,) = [line for line in text.splitlines() if line.strip().startswith("y right")]
     assert line.split()[2:6] == ["not", "known", "not", "known"]
+    unheld = {**COMPASS["heading"], "stored_rms_deg": None, "stored_bias_deg": None}
+    assert "mean error: uncalibrated +12.25 → corrected -0.75 deg" in text_of(changed(heading=unheld))
     empty = {**COMPASS["heading"], "n": 0, "rms_deg": None, "from_s": None, "to_s": None}
     assert "against file truth.csv: no sample to score; left out: disarmed 123" in text_of(changed(heading=empty))
 

@@ -11,11 +11,16 @@ which is 2 (1 - cos s) (I - a a') / r^2 for a turn by s about the axis a.
 A motion's worth is the sum over the attitudes it passes through. Every motion gets the same time, so the one that
 leaves the least doubt in the worst axis is also the fastest. What no motion of this kind of vehicle could show is not
 asked for.
+
+Which axes count is the gate's to say: as long as it wants a better heading, or a forward or right axis, the down axis
+waits, for without it a compass may be ready all the same. Of few headings the gate believes no sigma, however small, so
+then a small one is no reason to be silent.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +37,7 @@ _READING_MG = 8.0  # of one second: mostly tilt error, which does not average ou
 _SECONDS = 12
 _HELPS = 0.9  # a motion that leaves more than this share of a sigma is not worth asking for
 _TIE = 1.01
+_LEVEL = frozenset({Reason.X_NOT_OBSERVED, Reason.Y_NOT_OBSERVED, Reason.HEADING_UNSURE})
 
 _PLANE = frozenset({1})
 _ROTARY = frozenset({2, 3, 4, 13, 14, 15, 29, 35})  # copters of 1 to 12 rotors
@@ -118,15 +124,24 @@ def sigma_after(m: Motion, covariance_mg2: Array, roll_rad: float, pitch_rad: fl
 
 
 def advise(
-    e: Estimate, roll_rad: float, pitch_rad: float, heading_rad: float | None, kind: int | None, limit_mg: float = 10.0
+    e: Estimate,
+    roll_rad: float,
+    pitch_rad: float,
+    heading_rad: float | None,
+    kind: int | None,
+    limit_mg: float = 10.0,
+    reasons: Collection[Reason] = (),
 ) -> str:
     """The motion that would shrink the worst sigma most, at most LONGEST characters; "" where nothing need be done.
 
-    kind : MAV_TYPE, None where it is not known. limit_mg : the gate's line; an axis under it needs nothing. The advice
-    is relative, so heading_rad (None where unknown) changes nothing: turning is worth the same from any heading.
+    kind : MAV_TYPE, None where it is not known. limit_mg : the gate's line; an axis under it needs nothing. reasons :
+    the verdict's; where one of them is about heading or a level axis, only those two axes count, the line does not.
+    The advice is relative, so heading_rad (None where unknown) changes nothing: turning is worth the same from any
+    heading.
     """
     before = np.asarray(gate.floored(e))
-    wanted = [i for i in range(3) if before[i] > limit_mg and e.says_b[i]]
+    axes, limit_mg = ((0, 1), 0.0) if _LEVEL.intersection(reasons) else ((0, 1, 2), limit_mg)
+    wanted = [i for i in axes if before[i] > limit_mg and e.says_b[i]]
     if not wanted:
         return ""
     own = np.sqrt(np.maximum(np.diag(e.covariance_mg2), 1e-12))

@@ -205,6 +205,8 @@ def _headings(compass: Json) -> list[RenderableType]:
     span = f"{_number(heading.get('from_s'), '.0f')} to {_number(heading.get('to_s'), '.0f')} s"
     stored = heading.get("stored_rms_deg")
     stored = "" if stored is None else f", as stored {_number(stored)}"
+    stored_mean = heading.get("stored_bias_deg")
+    stored_mean = "" if stored_mean is None else f", as stored {_number(stored_mean, '+.2f')}"
     claim = heading.get("sigma_deg")
     out: list[RenderableType] = [
         _para(f"  Heading RMS against {_word(heading['reference'])}:"),
@@ -212,6 +214,10 @@ def _headings(compass: Json) -> list[RenderableType]:
             f"    uncalibrated {_number(heading.get('uncalibrated_rms_deg'))}{stored}"
             f" → corrected {_number(heading.get('rms_deg'))} deg"
             f" (95 % within {_number(heading.get('p95_deg'))}, one sigma claimed: {_number(claim)})"
+        ),
+        _para(
+            f"    mean error: uncalibrated {_number(heading.get('uncalibrated_bias_deg'), '+.2f')}{stored_mean}"
+            f" → corrected {_number(heading.get('bias_deg'), '+.2f')} deg"
         ),
     ]
     only = compass.get("heading_offsets_only")
