@@ -243,7 +243,7 @@ def test_without_a_position_it_learns_and_with_one_later_it_is_surer():
     late = taught([*flight[:200], *placed(flight[200:])]).estimate(EXPECTED)
     sigma = [np.sqrt(np.diag(e.covariance_mg2)) for e in (blind, late)]
     assert sigma[1][2] < 0.9 * sigma[0][2]  # down is what the model knows best
-    assert np.all(sigma[1] < 1.01 * sigma[0])
+    assert np.all(sigma[1] < 1.05 * sigma[0])  # of a mixture: the model may shift belief to a wider one
     for e, s in zip((blind, late), sigma, strict=True):
         assert np.all(np.abs(e.hard_iron_b_mg - HARD_IRON_MG) < 4.0 * s + 3.0)
 

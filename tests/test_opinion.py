@@ -13,7 +13,7 @@ from test_adaptive import HERE, placed, taught
 
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.answer import inverse2, symmetric, without_prior
+from magmav.core.estimators.adaptive.answer import inverse2, surprise, symmetric, without_prior
 from magmav.core.estimators.adaptive.bank import Bank, field_covariance
 from magmav.core.estimators.adaptive.block import Gathering
 from magmav.core.estimators.adaptive.opinion import doubt, own_covariance, stale
@@ -154,7 +154,7 @@ def test_of_motors_the_second_knows_nothing():
     before = take @ p @ take.T
     iron = take @ mean
     e = joining(Said(iron, theirs))
-    e._drive2 = 0.04
+    e._drives = (0.0, 0.04)
     got = e._joined(mean, take, p @ take.T, before, before, EXPECTED)[1]
     wider = theirs + 0.04 * 2500.0 * np.eye(3)
     assert got == pytest.approx(np.linalg.inv(np.linalg.inv(before) + np.linalg.inv(wider)))
@@ -217,9 +217,9 @@ def test_without_a_second_opinion_the_answer_is_the_banks_own():
     e = taught(placed(samples("figure eight", 21, seconds=20.0)), AdaptiveEstimator(second=False))
     mean, p = e._bank.mixture()
     got = e.estimate(EXPECTED)
-    assert got.hard_iron_b_mg == pytest.approx(mean[at.B] + e._drive * mean[at.K], abs=1e-12)
+    assert got.hard_iron_b_mg == pytest.approx(mean[at.B] + e._drives[0] * mean[at.K], abs=1e-12)
     assert got.covariance_mg2 == pytest.approx(p[at.B, at.B], abs=1e-9)
-    assert got.apart == 0.0
+    assert got.apart == pytest.approx(1.2 * surprise(mean[at.H], mean[at.V], HERE, N))  # only the world model's word
     assert (got.horizontal_mg, got.down_mg) == (mean[at.H], mean[at.V])
 
 
@@ -264,7 +264,7 @@ def test_what_joins_begins_at_that_iron_with_north_where_the_last_reading_shows_
     body = body_from_earth(roll, pitch, yaw)
     u = body @ (HERE[0] * math.cos(north), HERE[0] * math.sin(north), HERE[1])
     iron, sigma = np.array((120.0, -80.0, 33.0)), np.array((4.0, 5.0, 6.0))
-    bank = bank_of(HARD)
+    bank = Bank.begun((HERE[0], 4.0, HERE[1], 4.0), N)
     before = copy.deepcopy(bank)
     bank.join(iron, sigma, block_at(roll, pitch, yaw, u + iron), HERE if known else None, N)
     k = len(before)

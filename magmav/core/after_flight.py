@@ -183,8 +183,15 @@ class _Pass(AdaptiveEstimator):
         self.field = super()._prior(s, z, down_b)
         return self.field
 
+    def _begun(self, field: tuple[float, float, float, float], iron_mg: Array | None = None) -> Bank:
+        return Bank.begun(field, self.tuning, iron_mg)  # either way's models must have their like always
+
+    def _lose_heading(self, bank: Bank) -> None:
+        super()._lose_heading(bank)
+        bank.part(self.tuning)
+
     def _learn(self) -> None:
-        self._times_ns = [s.boot_ns for s in self._gathering._samples]
+        self._times_ns = self._gathering.boots_ns
         self.ends_ns = min(self._times_ns), max(self._times_ns)
         if self._alpha_rad is not None and self._bank is not None and not self.seen:
             away = np.abs((self._bank.x[:, at.ALPHA] - self._alpha_rad + math.pi) % TAU - math.pi)
@@ -279,7 +286,8 @@ class _BothWays:
             blocks = len(one.seen)  # grows with each block
             one.step(s)
             if len(one.seen) > blocks and one.ends_ns[1] >= due_ns:
-                due_ns = self._note() + _EVERY_NS
+                self._note()
+                due_ns = max(due_ns + _EVERY_NS, one.ends_ns[1] + _EVERY_NS // 2)
         if one.seen:
             self._note()
 

@@ -47,6 +47,7 @@ _GROUND_MG, _AZIMUTH_RAD = 40.0, math.radians(4.0)
 _JUMP_MG, _JUMP_CHI2, _JUMP_FLOOR_MG = 30.0, 50.0, 2.0
 _BAD_MG, _BAD_TIMES = 15.0, 2.5
 _SEARCHES_S = 15.0
+_FITS_MG = 30.0  # of residual: more is no fit
 _FIT_AT = (3, 6, 12, 24)  # blocks; later every 15
 
 
@@ -77,6 +78,7 @@ class _Watched:
     fitted_at: tuple[int, int] = (0, 0)
     found: tuple[Cause, ...] = ()
     changed_ago_s: float = 0.0
+    residual_mg: float = 0.0
 
 
 class Causes:
@@ -164,11 +166,13 @@ class Causes:
     def _changes(self, w: _Watched, e: Estimate) -> None:
         """The estimator says that the iron changed suddenly: what came before may be another compass's story.
 
-        Said again soon after, it is the estimator that searches: of a compass turned on its mount it finds no end.
+        Said again soon after, or where nothing fitted before either, it is the estimator that searches: of a compass
+        turned on its mount it finds no end.
         """
-        if e.changed_ago_s < w.changed_ago_s - 1.0 and w.changed_ago_s > _SEARCHES_S:
+        settled = w.changed_ago_s > _SEARCHES_S and w.residual_mg < _FITS_MG
+        if e.changed_ago_s < w.changed_ago_s - 1.0 and settled:
             w.era += 1
-        w.changed_ago_s = e.changed_ago_s
+        w.changed_ago_s, w.residual_mg = e.changed_ago_s, e.residual_mg
 
     # ------------------------------------------------------------ by the fit
 

@@ -34,7 +34,10 @@ class Reason(Enum):
     TWO_AXES = (22, "two axes used: the third comes from the dip of the place; without a position no heading")
     MOUNTING_WRONG = (23, "compass is mounted turned against the vehicle: see causes")
     SCALE_WRONG = (24, "compass shows the wrong strength of field: see causes")
-    OPINIONS_DIFFER = (25, "the second opinion, from the field's length alone, differs by more than chance")
+    OPINIONS_DIFFER = (
+        25,
+        "another opinion, the field's length alone or the world model, differs by more than chance",
+    )
     NO_CALIBRATION = (21, "no calibration that is ready for this compass")
     ARMED = (30, "vehicle is armed")
     NOT_LANDED = (31, "vehicle is not known to be on the ground")

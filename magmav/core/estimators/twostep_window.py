@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.packing import upper, whole
+
 Array = NDArray[np.floating[Any]]
 Point = tuple[float, float, float]
 
@@ -83,6 +85,14 @@ class Blocks:
         self._first: Point = (0.0, 0.0, 0.0)
         self._cell_s = self._block_s = 0.0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The sums are symmetric to the last bit."""
+        return self.__dict__ | {"sums": upper(self.sums)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.sums = whole(state["sums"], SIZE)
+
     def add(self, t_s: float, point_mg: Point) -> Cells | None:
         """Take one value; the cells of the block before it if that ended here."""
         x, y, z = point_mg
@@ -119,7 +129,8 @@ class Blocks:
         mean[:, 0] = 1.0
         mean[:, 5:] = rows[:, 1 + PAIRS_I] * rows[:, 1 + PAIRS_J]
         self._rows = []
-        self.sums = np.concatenate((self.sums, (mean.T @ (mean * weight[:, None]))[None]))
+        sums = mean.T @ (mean * weight[:, None])
+        self.sums = np.concatenate((self.sums, (0.5 * (sums + sums.T))[None]))
         self.cells = np.append(self.cells, float(len(rows)))
         self.begun_s = np.append(self.begun_s, self._block_s)
         self._level.append(0)

@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.answer import symmetric, without_prior
+from magmav.core.estimators.adaptive.answer import surprise, symmetric, without_prior
 from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
@@ -43,6 +44,7 @@ _FLOOR_MG = (
     1.0,
 )  # lower than others': how much structure the readings have shows in its noise
 _BESIDE_MG = 5.0  # what the second opinion may be off beyond twice its sigma, where it competes
+_FIELD_APART = 1.2  # who has heard the model cannot be as far from it as who has not
 _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 
 
@@ -67,6 +69,9 @@ class AdaptiveEstimator:
         self._drive = 0.0  # mean of what k is multiplied with
         self._driven = 0
         self._drive2 = 0.0  # its variance
+        self._drives = (0.0, 0.0)  # both, as of the last block
+        self._learnt = 0  # blocks, ever
+        self._answered: tuple[tuple[object, ...], Estimate] | None = None  # and what it rests on
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
@@ -114,7 +119,7 @@ class AdaptiveEstimator:
             self._drive += (drive - self._drive) / self._driven
             self._drive2 += ((drive - self._drive) ** 2 - self._drive2) / self._driven
         if self._bank is None:
-            self._bank = Bank.begun(self._prior(s, z, down_b), n)
+            self._bank = self._begun(self._prior(s, z, down_b))
         if self._by_hand and not s.by_hand:
             self._leave_ground(s, z, down_b)
             gathering = self._gathering
@@ -134,13 +139,19 @@ class AdaptiveEstimator:
             return s.model_mg[0], n.model_mg, s.model_mg[1], n.model_mg
         return (*n.blind_h_mg, float(z @ down_b), n.blind_v_mg)
 
+    def _begun(self, field: tuple[float, float, float, float], iron_mg: Array | None = None) -> Bank:
+        return Bank.opened(field, self.tuning, iron_mg)
+
+    def _lose_heading(self, bank: Bank) -> None:
+        bank.lose_heading(self.tuning)
+
     def _leave_ground(self, s: Sample, z: Array, down_b: Array) -> None:
         """What stood about it while it was turned by hand does not fly along: only where the iron is about stays."""
         if len(self._gathering):
             self._learn()
         assert self._bank is not None
         iron_mg = self._bank.mixture()[0][at.B]
-        self._bank = Bank.begun(self._prior(s, z, down_b), self.tuning, iron_mg)
+        self._bank = self._begun(self._prior(s, z, down_b), iron_mg)
         self._tilting = Tilting()
         self._gathering = Gathering()
         self._samples = self._blocks = self._residual_n = 0
@@ -151,22 +162,29 @@ class AdaptiveEstimator:
         """Take in the block that has gathered."""
         n, bank, block = self.tuning, self._bank, self._gathering.close()
         assert bank is not None  # made with the first sample
-        if self._lost:
-            bank.lose_heading(n)
-            self._lost = False
+        if self._lost and self._blocks:  # who has just begun knows no heading anyway
+            self._lose_heading(bank)
+        self._lost = False
         if block.dt_s > 0.0 and self._blocks:
             bank.x[:, at.ALPHA] += block.turned_rad
             advance(bank, block.dt_s, block.down_s, block.turn_rad2, block.own_tilt_rad, n)
         self._update(bank, block)
         self._blocks += 1
+        self._learnt += 1
+        self._drives = self._drive, self._drive2
         self._joined_ago_s += block.dt_s
         if self._blocks % n.prune_every:
             return
         if self._joined_ago_s > n.join_every_s:
             self._compete(block)
-        if len(self._bank or ()) > len(MODELS):
-            assert self._bank is not None
-            self._bank.tidy(n, n.most if self._blocks * n.block_s > n.narrow_s else len(self._bank))
+        bank, narrow = self._bank, self._blocks * n.block_s > n.narrow_s
+        assert bank is not None
+        most = n.most if narrow else n.most_at_first
+        if len(bank) > len(MODELS):
+            bank.tidy(n, most)
+        if not bank.parted and (narrow or len(bank) <= n.part_at):
+            bank.part(n)
+            bank.tidy(n, most)  # who has not watched for long has seen no drift: one such hypothesis will do
 
     def _compete(self, block: Block) -> None:
         """Where the second opinion is another, let it compete: the bank may have gone astray."""
@@ -243,7 +261,7 @@ class AdaptiveEstimator:
         self._change.open(bank)
         if self._model_mg is None and math.sqrt(bank.mixture()[1][at.H, at.H]) > n.blind_h_mg[1] * n.field_known:
             field = (*n.blind_h_mg, float(block.z[-1] @ block.down_b[-1]), n.blind_v_mg)
-            self._bank = Bank.begun(field, n)
+            self._bank = self._begun(field)
             self._blocks = 0
 
     # ------------------------------------------------------------ answer
@@ -252,19 +270,35 @@ class AdaptiveEstimator:
         """Belief now."""
         if self._bank is None or self._samples < 10:
             return None
-        mean, covariance = self._bank.mixture()
+        said = None if self._second is None else self._second.opinion(expected)
+        level = self._tilting.rms_rad < self.tuning.least_tilt_rad  # it may be the attitude's own noise that tilts
+        old = self._second is not None and stale(self._second, self._change.since_s)
+        rests_on = (self._learnt, said, old, level, expected is None)
+        if self._answered is None or self._answered[0] != rests_on:
+            self._answered = rests_on, self._answer(self._bank, expected, level)
+        return replace(self._answered[1], samples=self._samples)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What was answered since the last block is made again when asked."""
+        return self.__dict__ | {"_answered": None}
+
+    def _answer(self, bank: Bank, expected: ExpectedField | None, level: bool) -> Estimate:
+        mean, covariance = bank.mixture()
         take = self._take()
         pulled = covariance @ take.T
         iron_mg2 = own_mg2 = take @ pulled
         if self._model_mg is not None:
             field_mg2 = covariance[at.H : at.V + 1, at.H : at.V + 1]
             own_mg2 = without_prior(iron_mg2, pulled[at.H : at.V + 1], field_mg2, *self._model_mg, self.tuning)
-        if self._tilting.rms_rad < self.tuning.least_tilt_rad:  # it may be the attitude's own noise that tilts
+        if level:
             unknown = _DOWN * self.tuning.blind_v_mg**2
             own_mg2 = own_mg2 + unknown
             if self._model_mg is None:
                 iron_mg2 = iron_mg2 + unknown
                 pulled[at.B] += unknown
+        field_apart = 0.0
+        if self._model_mg is not None:
+            field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
         mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
         soft = _EYE3 + soft_matrix(mean[at.S])
         return Estimate(
@@ -281,20 +315,20 @@ class AdaptiveEstimator:
             soft_iron_b=mat3(np.linalg.inv(soft), "soft iron"),
             says_b=(True, True, self._axes == 3),
             throttle_b_mg=vec3(mean[at.K], "throttle"),
-            throttle_mean=self._drive + 0.5,
+            throttle_mean=self._drives[0] + 0.5,
             floor_mg=_FLOOR_MG,
-            apart=apart,
+            apart=max(apart, _FIELD_APART * field_apart),
         )
 
     def _take(self) -> Array:
         """What makes of a state the iron at mean throttle, (3, n)."""
         take = np.zeros((3, at.SIZE))
-        take[:, at.B], take[:, at.K] = _EYE3, self._drive * self._inverse
+        take[:, at.B], take[:, at.K] = _EYE3, self._drives[0] * self._inverse
         return take
 
     def _motors_mg2(self, mean: Array) -> Array:
         """Variance of the motors' field, of which the second opinion knows nothing, (3, 3)."""
-        return self._drive2 * float(mean[at.K] @ mean[at.K]) * _EYE3
+        return self._drives[1] * float(mean[at.K] @ mean[at.K]) * _EYE3
 
     def _joined(
         self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None

@@ -35,6 +35,19 @@ def without_prior(iron_mg2: Array, cross_mg2: Array, field_mg2: Array, h_mg: flo
     return symmetric(iron_mg2 + cross_mg2.T @ np.array(inverse2(a, b, c)) @ cross_mg2)
 
 
+def surprise(h_mg: float, v_mg: float, model_mg: tuple[float, float], n: Tuning) -> float:
+    """By how many sigmas of its own doubt the readings have moved the world model's field.
+
+    A sensor whose scale is wrong shows another field, and until that is found the iron is bent to make up for it.
+    """
+    h, v = model_mg
+    gain2 = n.gain * n.gain
+    both = n.model_mg**2 + gain2 * h * h, gain2 * h * v, n.model_mg**2 + gain2 * v * v
+    (a, b), (_, c) = inverse2(*both)
+    x, y = h_mg - h, v_mg - v
+    return math.sqrt(a * x * x + 2.0 * b * x * y + c * y * y)
+
+
 def inverse2(a: float, b: float, c: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Of the symmetric matrix a b, b c."""
     d = a * c - b * b

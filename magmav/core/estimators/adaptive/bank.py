@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array, Index
-from magmav.core.estimators.adaptive.tuning import MODELS, Model, Tuning
+from magmav.core.estimators.adaptive.tuning import FIRST, MODELS, Model, Tuning
+from magmav.core.packing import upper, whole
 from magmav.core.rotation import TAU
 
 _COLUMNS: tuple[str, ...] = ("x", "p", "model", "log_weight", "prior", "walk_mg")
@@ -45,23 +48,19 @@ class Bank:
         self.prior = np.log([MODELS[m].weight for m in model])
 
     @staticmethod
-    def begun(
-        field: tuple[float, float, float, float],
-        n: Tuning,
-        iron_mg: Array | None = None,
-    ) -> Bank:
-        """One filter per heading and model. field: mean and sigma of H and of V, mG.
+    def opened(field: tuple[float, float, float, float], n: Tuning, iron_mg: Array | None = None) -> Bank:
+        """One filter per heading, of the first model alone: ``part`` adds the others.
 
-        iron_mg : (3,) where the iron may be looked for first; it may be n.ground_mg off.
+        field : mean and sigma of H and of V, mG.  iron_mg : (3,) where the iron may be looked for first; it may be
+        n.ground_mg off.
         """
         h, h_sigma, v, v_sigma = field
-        k = n.yaws * len(MODELS)
+        k, one = n.yaws, MODELS[FIRST]
         x, p = np.zeros((k, at.SIZE)), np.zeros((k, at.SIZE, at.SIZE))
-        model = np.repeat(np.arange(len(MODELS)), n.yaws)
-        x[:, at.ALPHA] = np.tile(np.arange(n.yaws) * TAU / n.yaws, len(MODELS))
+        x[:, at.ALPHA] = np.arange(k) * TAU / k
         x[:, at.H], x[:, at.V] = h, v
         diagonal = p.reshape(k, -1)[:, :: at.SIZE + 1]
-        diagonal[:, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
+        diagonal[:, at.ALPHA] = (0.5 * TAU / k) ** 2
         diagonal[:, at.B] = n.prior_iron_mg**2
         if iron_mg is not None:
             x[:, at.B] = iron_mg
@@ -71,20 +70,65 @@ class Bank:
         diagonal[:, at.E] = n.tilt_rad**2
         diagonal[:, at.D] = n.disturbance_mg**2
         diagonal[:, at.K] = n.throttle_mg**2
-        for m, one in enumerate(MODELS):
-            rows = model == m
-            diagonal[rows, at.R] = one.mounting_rad**2
-            diagonal[rows, at.S] = np.repeat((one.soft_diagonal**2, one.soft_cross**2), 3)
+        diagonal[:, at.R] = n.mounting_rad**2
+        diagonal[:, at.S] = one.soft_variances()
         diagonal[:, at.G] = n.gyro_rads**2
         diagonal[:, at.T] = n.delay_s**2
         diagonal[:, at.KAPPA] = n.kappa**2
-        log_weight = np.log([MODELS[m].weight / n.yaws for m in model])
-        return Bank(x, p, model, log_weight, n)
+        return Bank(x, p, np.full(k, FIRST), np.full(k, math.log(one.weight / k)), n)
+
+    @staticmethod
+    def begun(field: tuple[float, float, float, float], n: Tuning, iron_mg: Array | None = None) -> Bank:
+        """One filter per heading and model; field and iron_mg as ``opened`` has them."""
+        out = Bank.opened(field, n, iron_mg)
+        out.part(n)
+        return out
+
+    @property
+    def parted(self) -> bool:
+        """Are there other models than the first?"""
+        return bool((self.model != FIRST).any())
+
+    def part(self, n: Tuning) -> None:
+        """Add the other models: what the first would believe, had it known from the start how large S may be.
+
+        Their priors are as the first one's times a normal density in S, N(0, R), which may as well come in last; what
+        the data say of them against it is the mean of that density over what it believes now (Dickey 1971). Where they
+        allow for more, R is negative: the prior's information is taken back.
+        """
+        rows = np.flatnonzero(self.model == FIRST)
+        first, parts = MODELS[FIRST], []
+        for m, one in enumerate(MODELS):
+            part = copy.copy(self)
+            part.keep(rows)
+            own, theirs = one.soft_variances(), first.soft_variances()
+            if not np.array_equal(own, theirs):
+                part.log_weight += n.temper * part._told(own * theirs / (theirs - own), theirs / own)
+            part.log_weight += math.log(one.weight / first.weight)
+            part.model = np.full(len(rows), m)
+            part.walk_mg, part.prior = np.full(len(rows), one.iron_walk_mg), np.full(len(rows), math.log(one.weight))
+            parts.append(part)
+        for name in _COLUMNS:
+            setattr(self, name, np.concatenate([getattr(part, name) for part in parts]))
+
+    def _told(self, r: Array, shares: Array) -> Array:
+        """Take in that S is N(0, r), (6,); the log of the evidence for it (K,).
+
+        shares (6,) : of the priors' variances.
+        """
+        expected = self.p[:, at.S, at.S] + np.diag(r)
+        gain = self.p[:, :, at.S] @ np.linalg.inv(expected)
+        off = -self.x[:, at.S]
+        nis = (off * np.linalg.solve(expected, off[:, :, None])[:, :, 0]).sum(1)
+        self.x = self.x + (gain @ off[:, :, None])[:, :, 0]
+        p = self.p - gain @ self.p[:, at.S, :]
+        self.p = 0.5 * (p + p.transpose(0, 2, 1))
+        return np.asarray(0.5 * (np.log(np.abs(shares * r)).sum() - np.linalg.slogdet(expected)[1] - nis))
 
     def join(
         self, iron_mg: Array, sigma_mg: Array, block: Block, model_mg: tuple[float, float] | None, n: Tuning
     ) -> None:
-        """Let somebody else's iron, (3,) and its sigmas, compete: one hypothesis per model that begins there.
+        """Let somebody else's iron, (3,) and its sigmas, compete: one hypothesis per model that is here begins there.
 
         The last reading then says where north is and, without a model, how strong the field.
         """
@@ -93,7 +137,7 @@ class Bank:
         doubt_mg = float(np.linalg.norm(sigma_mg))
         blind = (math.hypot(north, east), doubt_mg, down, doubt_mg)
         field = blind if model_mg is None else (model_mg[0], n.model_mg, model_mg[1], n.model_mg)
-        new = Bank.begun(field, replace(n, yaws=1), iron_mg)
+        new = (Bank.begun if self.parted else Bank.opened)(field, replace(n, yaws=1), iron_mg)
         diagonal = np.einsum("kii->ki", new.p)
         diagonal[:, at.B] = sigma_mg**2
         new.x[:, at.ALPHA] = math.atan2(east, north)
@@ -104,15 +148,13 @@ class Bank:
             setattr(self, name, np.concatenate((getattr(self, name), getattr(new, name))))
 
     def lose_heading(self, n: Tuning) -> None:
-        """Any heading again: the best of each model goes on from every direction, with all else that it knows."""
-        w = self.weights()
-        best = [max(np.flatnonzero(self.model == m), key=lambda i: w[i]) for m in np.unique(self.model)]
-        share = np.array([w[self.model == self.model[i]].sum() for i in best])
-        self.keep(np.repeat(best, n.yaws))
-        self.log_weight = np.log(np.repeat(share / n.yaws, n.yaws) + 1e-300)
-        self.x[:, at.ALPHA] += np.tile(np.arange(n.yaws) * TAU / n.yaws, len(best))
+        """Any heading again: the best of the first model goes on from every direction, with all else that it knows."""
+        w = np.where(self.model == FIRST, self.log_weight, -np.inf)
+        self.keep(np.full(n.yaws_again, int(np.argmax(w))))
+        self.log_weight = np.zeros(n.yaws_again)
+        self.x[:, at.ALPHA] += np.arange(n.yaws_again) * TAU / n.yaws_again
         self.p[:, at.ALPHA, :] = self.p[:, :, at.ALPHA] = 0.0
-        self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws) ** 2
+        self.p[:, at.ALPHA, at.ALPHA] = (0.5 * TAU / n.yaws_again) ** 2
         self.x[:, at.E] = self.p[:, at.E, :] = self.p[:, :, at.E] = 0.0  # it was about axes that are lost
         np.einsum("kii->ki", self.p)[:, at.E] = n.tilt_rad**2
 
@@ -144,6 +186,14 @@ class Bank:
 
     def __len__(self) -> int:
         return len(self.x)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A covariance is symmetric to the last bit: half of it is enough."""
+        return self.__dict__ | {"p": upper(self.p)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.p = whole(state["p"], at.SIZE)
 
     def weights(self) -> Array:
         """(K,) that add to one."""

@@ -54,12 +54,15 @@ class Gathering:
     """Samples on their way into a block, and the time that has passed since the last one."""
 
     def __init__(self) -> None:
-        self._samples: list[Sample] = []
-        self._bodies: list[Array] = []
-        self._z: list[Array] = []
+        self._last: Sample | None = None
+        self.boots_ns: list[int] = []
+        # Plain numbers: small, saved or not.
+        self._bodies: list[list[list[float]]] = []
+        self._z: list[list[float]] = []
+        self._rates: list[list[float]] = []
         self._calmed: list[float] = []
         self._drives: list[float] = []
-        self._downs: list[Array] = []  # integral of down_b up to each sample
+        self._downs: list[list[float]] = []  # integral of down_b up to each sample
         self._dt_s = 0.0
         self._down_s: Array = np.zeros(3)
         self._turn_rad2 = self._turned_rad = 0.0
@@ -67,7 +70,7 @@ class Gathering:
         self._first_s = 0.0
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return len(self._z)
 
     @property
     def span_s(self) -> float:
@@ -76,9 +79,9 @@ class Gathering:
 
     def fits(self, s: Sample) -> bool:
         """Can this sample share a block with those already here?"""
-        if not self._samples:
+        last = self._last
+        if last is None:
             return True
-        last = self._samples[-1]
         if s.axes != last.axes or s.tilt_from != last.tilt_from:
             return False
         a, b = s.shaping.matrix, last.shaping.matrix
@@ -99,26 +102,29 @@ class Gathering:
 
     def add(self, s: Sample, z: Array, body_from_own: Array, calmed_rad: float, drive: float) -> None:
         """Take one sample. calmed_rad : tilt that was taken out of its attitude."""
-        if not self._samples:
+        if not self._z:
             self._first_s = self._dt_s
-        self._samples.append(s)
-        self._z.append(z)
-        self._bodies.append(body_from_own)
+        self._last = s
+        self.boots_ns.append(s.boot_ns)
+        self._z.append(z.tolist())
+        self._bodies.append(body_from_own.tolist())
+        self._rates.append(s.rate_b_rads.tolist())
         self._calmed.append(calmed_rad)
         self._drives.append(drive)
-        self._downs.append(self._down_s)
+        self._downs.append(self._down_s.tolist())
 
     def close(self) -> Block:
         """All of them as one block, and begin anew."""
         bodies = np.array(self._bodies)
         down_b = bodies[:, :, 2]
-        rates = np.array([s.rate_b_rads for s in self._samples])
+        rates = np.array(self._rates)
         turns = np.zeros((len(rates), 3, 6))
         turns[:, :, :2] = bodies[:, :, :2]
         turns[:, 0, 2] = turns[:, 1, 3] = 1.0
         turns[:, 0, 4], turns[:, 1, 4] = -down_b[:, 1], down_b[:, 0]
         turns[:, :, 5] = rates
-        last = self._samples[-1]
+        last = self._last
+        assert last is not None  # nobody closes an empty one
         out = Block(
             z=np.array(self._z),
             north_b=bodies[:, :, 0],

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True, slots=True)
 class Model:
@@ -14,13 +17,17 @@ class Model:
     iron_walk_mg: float  # per square root of a second
     soft_diagonal: float
     soft_cross: float
-    mounting_rad: float  # how crooked it may sit
+
+    def soft_variances(self) -> NDArray[np.float64]:
+        """Of the six numbers of S."""
+        return np.repeat((self.soft_diagonal**2, self.soft_cross**2), 3)
 
 
-HARD = Model(0.70, 0.05, 0.005, 0.0035, math.radians(0.3))
-SOFT_IRON = Model(0.27, 0.05, 0.04, 0.028, math.radians(0.3))
-DRIFT = Model(0.03, 0.7, 0.005, 0.0035, math.radians(0.3))
+HARD = Model(0.70, 0.05, 0.003, 0.002)
+SOFT_IRON = Model(0.27, 0.05, 0.04, 0.028)
+DRIFT = Model(0.03, 0.7, 0.003, 0.002)
 MODELS = (HARD, SOFT_IRON, DRIFT)
+FIRST = 0  # of MODELS: while the heading is unknown it stands for all
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +35,11 @@ class Tuning:
     """Noise, priors and lines."""
 
     yaws: int = 12
+    yaws_again: int = 8  # headings to begin from when all else is known
     prior_iron_mg: float = 300.0
     ground_mg: float = 100.0  # what was learnt by hand may be off by so much in flight
-    model_mg: float = 4.0  # of the world model, per component
+    mounting_rad: float = math.radians(0.2)  # how crooked the compass may sit
+    model_mg: float = 3.0  # of the world model, per component
     blind_h_mg: tuple[float, float] = (
         230.0,
         80.0,
@@ -38,8 +47,8 @@ class Tuning:
     blind_v_mg: float = 200.0
     field_known: float = 0.25  # of that sigma of H is left when the field counts as learnt
     soft_most: float = 0.15  # more is no soft iron but a filter gone astray
-    block_s: float = 0.2  # readings taken in together span at most this
-    block_readings: int = 6  # and are at most so many
+    block_s: float = 0.4  # readings taken in together span at most this
+    block_readings: int = 8  # and are at most so many
     white_mg: float = 5.0  # one reading's own noise at first, and its limits
     white_lo_mg: float = 2.0
     white_hi_mg: float = 15.0
@@ -76,8 +85,10 @@ class Tuning:
     join_every_s: float = 8.0
     join_behind: float = 2.0  # in log weight
     prune_below: float = 1e-4
+    part_at: int = 5  # hypotheses are left of the first model: time for the others
+    most_at_first: int = 10  # hypotheses are kept, and the best of each model
     narrow_s: float = 20.0  # of learning; from then on
-    most: int = 6  # hypotheses are kept, and the best of each model
+    most: int = 6
     merge_sigma: float = 0.35
     change_tau_s: float = 1.5
     change_chi2: float = 60.0
