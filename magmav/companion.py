@@ -13,17 +13,15 @@ from collections.abc import Iterable
 import numpy as np
 
 from magmav.coaching import Coaching
-from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult, Verdict
+from magmav.core.types import Change, Reason, Record, State, Verdict
 from magmav.mavlink.announce import Announcer
-from magmav.mavlink.autopilot.ardupilot import plan_change, wanted_names
+from magmav.mavlink.autopilot.ardupilot import wanted_names
 from magmav.mavlink.budget import Budget
-from magmav.mavlink.change import code_needed, largest_step_mg
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.fetch import ParamFetch
 from magmav.mavlink.intervals import Intervals
 from magmav.mavlink.params import ParamServer
 from magmav.mavlink.presence import Presence
-from magmav.mavlink.terms import UploadSettings
 from magmav.mavlink.upload import Upload
 from magmav.mavlink.watch import Watch
 from magmav.own_params import COMPASSES, entries
@@ -31,13 +29,11 @@ from magmav.pipeline import Pipeline
 from magmav.settings import Settings, SettingsError, with_value
 from magmav.store import SavedEstimate, Store, StoreError
 from magmav.vehicle import Vehicle as Flown
+from magmav.writing import Writer
 
 _log = logging.getLogger("magmav")
-_STALE_NS = 2_000_000_000
 _SAVE_EVERY_NS = 10_000_000_000
-_RETRY_RESTORE_NS = 30_000_000_000
-_CRITICAL, _WARNING, _INFO = 2, 4, 6
-_NOT_OURS = frozenset({Reason.OFFSETS_CHANGED, Reason.DEVICE_CHANGED, Reason.WRONG_VEHICLE})
+_WARNING, _INFO = 4, 6
 _SLOW = (
     "GLOBAL_POSITION_INT", "GPS_RAW_INT", "BATTERY_STATUS", "VFR_HUD", "SYSTEM_TIME", "EXTENDED_SYS_STATE",
 )  # fmt: skip
@@ -52,7 +48,10 @@ def wanted_rates(settings: Settings) -> dict[str, float]:
 
 
 class MagCompanion:
-    """Serves one vehicle. ``job`` is the write under way; ``ended`` the last one that came to an end."""
+    """Serves one vehicle. ``writer`` makes the writes.
+
+    serves : False for one write of the caller's and nothing else, no trigger and no pending restore.
+    """
 
     def __init__(
         self,
@@ -65,12 +64,6 @@ class MagCompanion:
         serves: bool = True,
     ) -> None:
         self.settings = settings
-        self._serves = serves  # False: one write of the caller's and nothing else, no trigger and no pending restore
-        self.confirm = 0.0
-        self.result = 0.0
-        self.job: Upload | None = None
-        self.ended: Upload | None = None
-        self.refusal: Reason | None = None
         self._pipeline = pipeline
         self._store = store
         self._unix_offset_ns = unix_offset_ns
@@ -79,9 +72,6 @@ class MagCompanion:
         self._states: dict[int, State] = {}
         self._saved_ns: dict[int, int] = {}
         self._said_ambiguous = False
-        self._retry_ns = 0
-        self._restoring: int | None = None
-        self._left_alone: set[int] = set()
         v = settings.vehicle
         self.presence = Presence(v.component, v.system or None)
         self._watch = Watch(self.presence)
@@ -90,6 +80,16 @@ class MagCompanion:
         self._budget = Budget(settings.wire.budget_bps)
         self.announcer = Announcer(self._budget, settings.wire.heading_hz)
         self._coaching = Coaching(pipeline.vehicles, lambda text, now: self.announcer.say(_INFO, f"MMAG {text}", now))
+        self.writer = Writer(
+            pipeline,
+            self._watch,
+            store,
+            self.announcer,
+            records=self._records,
+            settings=lambda: self.settings,
+            unix_offset_ns=unix_offset_ns,
+            serves=serves,
+        )
         self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, self._budget)
 
     def ask_for(self, names: Iterable[str]) -> None:
@@ -116,8 +116,7 @@ class MagCompanion:
         self._watch.on_message(message, route, now_ns)
         for machine in (self._intervals, self._fetch):
             out += machine.on_message(message, route, now_ns)
-        if self.job is not None:
-            out += self.job.on_message(message, route, now_ns)
+        out += self.writer.on_message(message, route, now_ns)
         return self._counted(out, now_ns) + self._server.on_message(message, route, now_ns)
 
     def on_record(self, record: Record, now_ns: int) -> None:
@@ -143,15 +142,7 @@ class MagCompanion:
         if self.presence.ambiguous and not self._said_ambiguous:
             self._said_ambiguous = True
             _log.warning("several vehicles %s; choose one with --system ID", self.presence.ambiguous)
-        out: list[Outgoing] = []
-        if self.job is not None:
-            flown = self.flown()
-            if flown is not None:
-                flown.settle(self.job.change.compass)  # the stream jumps a moment before the echo says so
-            out += self.job.poll(now_ns)
-            self._finish(self.job, now_ns)
-        elif self._serves and now_ns >= self._retry_ns:
-            self._restore_pending(now_ns)
+        out = self.writer.poll(now_ns)
         for machine in (self.presence, self._intervals, self._fetch):
             out += machine.poll(now_ns)
         return self._counted(out, now_ns) + self._server.poll(now_ns) + self.announcer.poll(now_ns)
@@ -174,8 +165,7 @@ class MagCompanion:
 
     def record(self, compass: int, now_ns: int) -> Record | None:
         """Latest Record of a compass, None when it is over two seconds old."""
-        record = self._records.get(compass)
-        return record if record is not None and now_ns - record.t_ns <= _STALE_NS else None
+        return self.writer.fresh(compass, now_ns)
 
     def choose(self, section: str, key: str, value: float) -> bool:
         """Change one setting in flight; False when it is out of its limits."""
@@ -191,117 +181,60 @@ class MagCompanion:
         self.announcer.rate(self.settings.wire.heading_hz)
         return True
 
+    # ------------------------------------------------------------ writing
+
+    @property
+    def job(self) -> Upload | None:
+        """The write under way."""
+        return self.writer.job
+
+    @property
+    def ended(self) -> Upload | None:
+        """The last write that came to an end."""
+        return self.writer.ended
+
+    @ended.setter
+    def ended(self, job: Upload | None) -> None:
+        self.writer.ended = job
+
+    @property
+    def refusal(self) -> Reason | None:
+        """Why nothing was begun, when asked last."""
+        return self.writer.refusal
+
+    @property
+    def confirm(self) -> float:
+        """The confirmation code that was given."""
+        return self.writer.confirm
+
+    @confirm.setter
+    def confirm(self, code: float) -> None:
+        self.writer.confirm = code
+
+    @property
+    def result(self) -> float:
+        """How the last write went, as MMAG_RESULT shows it."""
+        return self.writer.result
+
     def request_upload(self, compass: int, now_ns: int) -> None:
         """Upload what is known now, if the gate says it may be."""
-        record = self.record(compass, now_ns)
-        change = self.plan(compass)
-        if self.job is not None or not self._serves:
-            self._refuse(Reason.BUSY, now_ns)
-        elif record is None or record.verdict.state is not State.READY:
-            self._refuse(Reason.NO_CALIBRATION, now_ns)
-        elif change is None:
-            self._refuse(Reason.NOT_OBSERVED, now_ns)
-        else:
-            self.start(change, int(self.confirm), now_ns)
+        self.writer.request_upload(compass, now_ns)
 
     def request_restore(self, compass: int, now_ns: int) -> None:
         """Bring back the values from before the last upload of this compass."""
-        flown = self.flown()
-        device = 0 if flown is None else flown.calibrations.device_id(compass)
-        row = self._store.last_restorable(self.presence.system, compass, device)
-        if self.job is not None or not self._serves:
-            self._refuse(Reason.BUSY, now_ns)
-        elif row is None:
-            self._refuse(Reason.NO_SNAPSHOT, now_ns)
-        else:
-            self.start(row.change, None, now_ns, undoes=row.id)
-
-    # ------------------------------------------------------------ writing
+        self.writer.request_restore(compass, now_ns)
 
     def flown(self) -> Flown | None:
         """The served vehicle in the pipeline."""
-        return None if self.presence.autopilot is None else self._pipeline.vehicles.get(self.presence.system)
+        return self.writer.flown()
 
     def plan(self, compass: int) -> Change | None:
         """The change the present estimate asks for, on the axes that are known; None when there is none."""
-        flown, record = self.flown(), self._records.get(compass)
-        if flown is None or record is None or record.estimate.samples == 0:
-            return None
-        x, y, z = (axis is not AxisState.NOT_OBSERVED for axis in record.verdict.axes)
-        iron = record.estimate.hard_iron_b_mg
-        return plan_change(flown.calibrations, self.presence.system, compass, iron, record.sigma_mg, (x, y, z))
+        return self.writer.plan(compass)
 
     def start(self, change: Change, confirm: int | None, now_ns: int, undoes: int | None = None) -> None:
         """Begin a write; its messages come out of poll. ValueError while another one runs."""
-        if self.job is not None:
-            raise ValueError("start: a write is under way; wait for its end")
-        limits = UploadSettings(confirm_above_mg=self.settings.upload.confirm_above_mg)
-        self.refusal = None
-        self.job = Upload(
-            change,
-            self._watch,
-            journal=self._store,
-            confirm=confirm,
-            undoes=undoes,
-            vehicle=str(change.system),
-            unix_offset_ns=self._unix_offset_ns,
-            settings=limits,
-        )
-        self.result = 1.0
-        flown = self.flown()
-        if flown is not None:
-            # The stream will jump by what we ourselves write: undone exactly, nothing is learnt again.
-            flown.calibrations.expect(change.names, change.old)
-            flown.calibrations.expect(change.names, change.new)
-        self.job.start(now_ns)
-        self._finish(self.job, now_ns)
-
-    def _finish(self, job: Upload, now_ns: int) -> None:
-        if job.result is None:
-            return
-        self.job, self.ended = None, job
-        if self._restoring is not None and _NOT_OURS.intersection(job.reasons):
-            # Somebody else's values are there now: never overwritten unasked (design, rule 10).
-            self._left_alone.add(self._restoring)
-            text = f"MMAG write {self._restoring} not undone: magmav history"
-            self.announcer.say(_CRITICAL, text, now_ns)
-        self._restoring = None
-        code = float(job.result.value)
-        if job.result is UploadResult.REFUSED:
-            code = -float(job.reasons[0].number) if job.reasons else -1.0
-        self.result = code
-        worst = job.result in (UploadResult.PENDING_RESTORE, UploadResult.WRITTEN_UNPROVEN)
-        words = "; ".join(r.text for r in job.reasons)
-        _log.info("compass %d: %s", job.change.compass, job.progress)
-        text = f"MMAG c{job.change.compass} {job.result.name}" + (f": {words}" if words else "")
-        self.announcer.say(_CRITICAL if worst else _INFO, text, now_ns)
-        code_text = code_needed(job.change, self.settings.upload.confirm_above_mg)
-        if Reason.CONFIRM_CHANGE in job.reasons and code_text is not None:
-            step = largest_step_mg(job.change)
-            self.announcer.say(_WARNING, f"MMAG change of {step:.0f} mG: MMAG_CONFIRM {code_text}", now_ns)
-
-    def _refuse(self, reason: Reason, now_ns: int) -> None:
-        self.refusal = reason
-        if self.job is None:  # while a write runs, the result is that it runs
-            self.result = -float(reason.number)
-        self.announcer.say(_WARNING, f"MMAG refused: {reason.text}", now_ns)
-
-    def _restore_pending(self, now_ns: int) -> None:
-        """A write that was cut short is taken back at the next chance; the machine itself checks that it may."""
-        autopilot = self.presence.autopilot
-        if autopilot is None or autopilot.armed or not self._watch.landed(now_ns):
-            return
-        self._retry_ns = now_ns + _RETRY_RESTORE_NS
-        try:
-            rows = [r for r in self._store.pending() if r.change.system == autopilot.system]
-        except StoreError as error:
-            _log.error("%s", error)
-            return
-        rows = [r for r in rows if r.id not in self._left_alone]
-        if rows:
-            self._restoring = rows[0].id
-            self.announcer.say(_WARNING, "MMAG restoring a write that was cut short", now_ns)
-            self.start(rows[0].change, None, now_ns, undoes=rows[0].id)
+        self.writer.start(change, confirm, now_ns, undoes)
 
     # ------------------------------------------------------------ keeping and telling
 

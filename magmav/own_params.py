@@ -21,7 +21,11 @@ class Board(Protocol):
 
     settings: Settings
     confirm: float
-    result: float
+
+    @property
+    def result(self) -> float:
+        """How the last write went; see MMAG_RESULT."""
+        ...
 
     def record(self, compass: int, now_ns: int) -> Record | None:
         """Latest Record of a compass of the served vehicle, None when there is none or it is stale."""
