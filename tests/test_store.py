@@ -48,7 +48,7 @@ def test_a_write_is_kept_exactly(store: Store) -> None:
 
 @given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=3, max_size=3))
 @settings(max_examples=20, deadline=None)
-def test_AT4b_every_float32_comes_back_bit_for_bit(
+def test_AT_4b_every_float32_comes_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, values: list[float]
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "exact.sqlite"

@@ -27,7 +27,10 @@ class Journal(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class UploadSettings:
-    """Limits and waits. offs_max_mg tightens COMPASS_OFFS_MAX of the vehicle; None leaves it as it is."""
+    """Limits and waits. offs_max_mg tightens COMPASS_OFFS_MAX of the vehicle; None leaves it as it is.
+
+    Tries and lingering allow for an answer that takes 4 s, as over a link with 2 s of latency each way.
+    """
 
     offs_max_mg: float | None = None
     confirm_above_mg: float = CONFIRM_ABOVE_MG
@@ -37,15 +40,15 @@ class UploadSettings:
     preflight_ns: int = 10_000 * _MS
     watch_ns: int = 2500 * _MS  # long enough for two heartbeats of a second route
     baseline_ns: int = 8000 * _MS
-    write_tries: int = 6
-    read_tries: int = 16
+    write_tries: int = 12
+    read_tries: int = 24
     rounds: int = 3
     settle_ns: int = 500 * _MS
     proof_ns: int = 6000 * _MS
-    linger_ns: int = 3000 * _MS  # a delayed copy of an earlier write has arrived by then
+    linger_ns: int = 4500 * _MS  # a delayed copy of an earlier write, and its echo, have arrived by then
     silent_ns: int = 5000 * _MS  # nothing at all from the autopilot
     heartbeat_lost_ns: int = 10_000 * _MS
-    whole_ns: int = 120_000 * _MS
+    whole_ns: int = 180_000 * _MS
 
 
 class Phase(Enum):
