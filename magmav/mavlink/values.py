@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from magmav.mavlink.codec import Message
 
 _FLOAT = struct.Struct("<f")
+_V2 = 0xFD
 _INTEGERS = {
     dialect.MAV_PARAM_TYPE_UINT8: "<B",
     dialect.MAV_PARAM_TYPE_INT8: "<b",
@@ -28,10 +29,11 @@ _REAL32 = dialect.MAV_PARAM_TYPE_REAL32
 
 def payload_bytes(message: Message) -> bytes:
     """The four bytes of param_value: as they came, or as they would go out of a message made here."""
-    payload = message.get_payload()
-    if payload is None:
+    frame = message.get_msgbuf()  # get_payload() of pymavlink 2.4.50 cuts as if every frame were MAVLink 1
+    if not frame:
         return _FLOAT.pack(message.param_value)
-    return bytes(payload[:4]).ljust(4, b"\0")  # first in both messages; MAVLink 2 cuts zeros off the end
+    at = 10 if frame[0] == _V2 else 6
+    return bytes(frame[at : at + min(4, frame[1])]).ljust(4, b"\0")  # first in both; MAVLink 2 cuts zeros off the end
 
 
 def cast(message: Message) -> float | None:
@@ -61,7 +63,7 @@ def set_bytewise(system: int, component: int, name: str, value: float, param_typ
     """PARAM_SET with the bytes of the number's type.
 
     ValueError for a number the type cannot hold, and for an integer whose bytes do not survive the way through a float
-    (-1 does not: its bytes are a NaN, and a NaN may lose bits on the way).
+    (-4194305 does not: its bytes are a signalling NaN, and that loses a bit on the way).
     """
     if param_type == _REAL32:
         return set_cast(system, component, name, value, param_type)

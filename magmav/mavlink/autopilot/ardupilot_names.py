@@ -104,9 +104,7 @@ class ArduPilot:
             if not _OFFSET.fullmatch(name):
                 raise ValueError(f"change: {name!r} is not a compass offset, and nothing else is ever written")
         device = _DEVICE.fullmatch(change.device_name)
-        stems = {name[:-1] for name in change.names}
-        belongs = device and {_number(_OFFSET.fullmatch(name)) for name in change.names} == {_number(device)}
-        if len(stems) != 1 or not belongs:
+        if device is None or {_whose(_OFFSET.fullmatch(name)) for name in change.names} != {_whose(device)}:
             raise ValueError(f"change: {change.names!r} and {change.device_name!r} are not of one compass")
         return exact(change)
 
@@ -163,5 +161,6 @@ def exact(change: Change) -> Change:
     return replace(change, old=tuple(map(float32, change.old)), new=tuple(map(float32, change.new)))
 
 
-def _number(match: re.Match[str] | None) -> str:
-    return "" if match is None else match.group(1) or match.group(2) or "1"
+def _whose(match: re.Match[str] | None) -> tuple[str | None, ...]:
+    """Number and scheme in a name."""
+    return () if match is None else match.groups()[:2]
