@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Protocol
 
 from magmav.link import Link, LinkError, Packet
-from magmav.link.frames import cut
+from magmav.link.frames import V2, cut
 
 _FLUSH_NS = 1_000_000_000
 _FLUSH_BYTES = 1 << 16
 _MOST_EARLY = 256  # sends kept until the link first tells the time
+_SETUP_SIGNING = (256).to_bytes(3, "little")  # the message that carries a signing key (S17)
 _MOST_ROUTES = 64  # unfinished frames kept, one for each route
 
 
@@ -30,7 +31,8 @@ class TlogRecorder:
     A path is appended to, never overwritten, and closed with the link; a file object stays the caller's.
     A frame sent carries the time of the last packet. Written at least every second of link time. When the
     disk is full recording stops ("recording stopped") and the link goes on.
-    counts (the link's own): "recorded", "unrecorded bytes" that formed no frame, "recording stopped".
+    counts (the link's own): "recorded", "unrecorded bytes" that formed no frame, "keys not recorded" (SETUP_SIGNING),
+    "recording stopped".
     """
 
     def __init__(self, link: Link, target: str | Path | ByteSink) -> None:
@@ -105,8 +107,11 @@ class TlogRecorder:
         # The two lowest bits of a tlog's time are read as a link number by others: ours is 0.
         stamp = (((self._now_ns + self.unix_offset_ns) // 1000) & ~3).to_bytes(8, "big")
         for frame in found.frames:
+            if frame[0] == V2 and frame[7:10] == _SETUP_SIGNING:
+                self.counts["keys not recorded"] += 1
+                continue
             self._waiting += stamp + frame
-        self.counts["recorded"] += len(found.frames)
+            self.counts["recorded"] += 1
 
     def _write(self) -> None:
         """Hand what waits to the file. Raw writes may take less than offered."""

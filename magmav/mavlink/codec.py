@@ -9,7 +9,7 @@ The wire is counted, never raises.
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -30,21 +30,43 @@ class Outgoing(NamedTuple):
     route: str = ""
 
 
+class Signer(Protocol):
+    """What signs our frames and judges others'; signing.Signing is one."""
+
+    counts: Counter[str]
+
+    def sign(self, frame: bytes) -> bytes:
+        """The frame with its signature behind it."""
+        ...
+
+    def good(self, frame: bytes, number: int) -> bool:
+        """Whether a frame of this message number is to be believed."""
+        ...
+
+
+def is_signed(message: Message) -> bool:
+    """Whether it came with a signature, checked or not."""
+    return bool(message.get_header().incompat_flags & _SIGNED)
+
+
 class Codec:
     """Cuts frames per route, checks them, and packs our own messages.
 
     wanted : names of the messages to decode; others are checked, counted and left alone. None decodes all.
-    counts : "messages", "skipped", "unknown", "bad crc", "garbage bytes", "bad content".
+    signer : signs what is packed; what it does not call good is not decoded. None: signed frames are taken unchecked.
+    counts : "messages", "skipped", "unknown", "bad crc", "garbage bytes", "bad content", "not believed".
     """
 
-    def __init__(self, wanted: frozenset[str] | None = None) -> None:
+    def __init__(self, wanted: frozenset[str] | None = None, signer: Signer | None = None) -> None:
         self.counts: Counter[str] = Counter()
+        self.signer = signer
         self._mav = dialect.MAVLink(None)
         self._rest: dict[str, bytes] = {}
         self._sequence: dict[tuple[int, int], int] = {}
         kinds = dialect.mavlink_map.items()
         self._seeds = {i: bytes((kind.crc_extra,)) for i, kind in kinds}  # the last byte of each message's checksum
-        self._wanted = {i for i, kind in kinds if wanted is None or kind.msgname in wanted}
+        # SETUP_SIGNING carries a key: nobody here has any business with it (S17).
+        self._wanted = {i for i, k in kinds if (wanted is None or k.msgname in wanted) and k.msgname != "SETUP_SIGNING"}
 
     def decode(self, data: bytes, route: str, *, whole: bool) -> list[Message]:
         """Messages completed by these bytes. ``whole``: a datagram, nothing is carried over to the next.
@@ -96,6 +118,9 @@ class Codec:
         if number not in self._wanted:
             self.counts["skipped"] += 1
             return True
+        if self.signer is not None and not self.signer.good(frame, number):
+            self.counts["not believed"] += 1
+            return True
         try:
             message = self._mav.decode(bytearray(frame))
         except (dialect.MAVError, ValueError, UnicodeError):
@@ -113,7 +138,14 @@ class Codec:
         mav.seq = self._sequence.get(key, 0)
         frame = bytes(message.pack(mav))
         self._sequence[key] = (mav.seq + 1) & 0xFF
-        return frame
+        return frame if self.signer is None else self._signed(frame, self.signer)
+
+    def _signed(self, frame: bytes, signer: Signer) -> bytes:
+        """The checksum covers the flag that says signed, so it is made anew."""
+        number = frame[7] | frame[8] << 8 | frame[9] << 16
+        body = bytes((_V2, frame[1], frame[2] | _SIGNED)) + frame[3:-2]
+        crc = crc16.mcrf4xx(body[1:] + self._seeds[number])
+        return signer.sign(body + crc.to_bytes(2, "little"))
 
 
 def _next_magic(data: bytes, at: int) -> int:
