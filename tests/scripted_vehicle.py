@@ -68,6 +68,8 @@ class Vehicle:
         self.gyro_mrads = 2
         self.speed_cms: int | None = None
         self.calibrating = False
+        self.committed = True  # the device id is on record; else it says "not calibrated"
+        self.knows_prearm_checks = True
         self.loss = 0.0
         self.delay_ns = lambda: 5 * MS
         self.duplicate = 0.0
@@ -108,6 +110,8 @@ class Vehicle:
 
     def _handle(self, message: Any) -> None:
         kind = message.get_type()
+        if kind == "COMMAND_LONG" and not self.deaf:
+            self._command(message)
         if kind not in ("PARAM_SET", "PARAM_REQUEST_READ") or self.deaf:
             return
         name = message.param_id
@@ -122,6 +126,14 @@ class Vehicle:
         self.say(dialect.MAVLink_param_value_message(name.encode(), self.params[name], 9, 1000, 65535))
         if kind == "PARAM_SET":
             self.on_set(name)
+
+    def _command(self, message: Any) -> None:
+        """MAV_CMD_RUN_PREARM_CHECKS is all it knows: acknowledged, and a text for what would not pass."""
+        mine = message.command == dialect.MAV_CMD_RUN_PREARM_CHECKS and self.knows_prearm_checks
+        result = dialect.MAV_RESULT_ACCEPTED if mine else dialect.MAV_RESULT_UNSUPPORTED
+        self.say(dialect.MAVLink_command_ack_message(message.command, result, 0, 0, self.system, 191))
+        if mine and not self.committed:
+            self.say(dialect.MAVLink_statustext_message(2, b"PreArm: Compass not calibrated"))
 
     def heartbeat(self, armed: bool | None = None) -> Any:
         base = 128 if (self.armed if armed is None else armed) else 0

@@ -195,7 +195,9 @@ def test_S9_S12_S13_nothing_is_sent_but_what_is_on_the_list(story):
     """No health is faked, no heading is fed to the EKF, nobody is impersonated: the list has no room for it."""
     assert {m.get_type() for _, _, m in story.sent} <= _MAY_SEND
     commands = [m for _, _, m in story.sent if m.get_type() == "COMMAND_LONG"]
-    assert {m.command for m in commands} == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
+    asks = {dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES}  # who are you?
+    may = {dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_RUN_PREARM_CHECKS} | asks
+    assert dialect.MAV_CMD_SET_MESSAGE_INTERVAL in {m.command for m in commands} <= may
     assert {m.get_srcComponent() for _, _, m in story.sent} == {191}
     own = {m.param_id for _, _, m in story.sent if m.get_type() == "PARAM_VALUE"}
     assert own and all(name.startswith("MMAG_") for name in own)

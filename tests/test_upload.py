@@ -18,6 +18,7 @@ from scripted_vehicle import MS, S, Vehicle, f32
 from upload_rig import NAMES, OLD, Rig, a_change, refused
 
 from magmav.core.types import Change, Reason, UploadResult
+from magmav.mavlink.autopilot.adapter import ADAPTERS
 from magmav.mavlink.change import checked, code_needed, confirmation_code, dry_run, restore_blockers
 from magmav.mavlink.proof import Window, moved_as_predicted
 from magmav.mavlink.terms import UploadSettings
@@ -53,10 +54,11 @@ def test_dry_run_names_exactly_what_is_sent() -> None:
     rig = Rig()
     said = [line.split(" (")[0] for line in dry_run(a_change())]
     rig.go()
-    sent = [
-        f"{m.get_type()} {m.param_id}" + (f" {m.param_value!r}" if m.get_type() == "PARAM_SET" else "")
-        for _, m in rig.vehicle.sent
-    ]
+    sent = []
+    for _, m in rig.vehicle.sent:
+        what = "MAV_CMD_RUN_PREARM_CHECKS" if m.get_type() == "COMMAND_LONG" else m.param_id
+        value = f" {m.param_value!r}" if m.get_type() == "PARAM_SET" else ""
+        sent.append(f"{m.get_type()} {what}{value}")
     assert sent == said
 
 
@@ -251,7 +253,7 @@ def test_S19_wrong_vehicle_and_other_autopilots_and_no_change_are_refused_at_onc
     refused(Rig(), Reason.NOTHING_TO_DO, change=a_change(0.0, 0.0, 0.0))
     rig = Rig()
     assert rig.presence.autopilot is not None
-    rig.presence.autopilot = replace(rig.presence.autopilot, kind=12)
+    rig.presence.autopilot = replace(rig.presence.autopilot, kind=4)
     upload = Upload(a_change(), rig.watch, journal=rig.journal)
     upload.start(rig.vehicle.now_ns)
     assert upload.reasons == (Reason.NOT_SUPPORTED,)
@@ -549,7 +551,7 @@ def raw_imu(mag: tuple[int, int, int], kind: str = "raw_imu") -> Any:
 
 
 def window(*values: tuple[int, int, int], compass: int = 1) -> Window:
-    out = Window(compass, 0)
+    out = Window(ADAPTERS[3].proof_streams(compass), 0)
     for value in values:
         out.add(raw_imu(value))
     return out
@@ -561,7 +563,7 @@ def test_window_counts_news_only() -> None:
     held.add(raw_imu((900, 900, 900), "scaled_imu"))  # the same compass through another message
     held.add(raw_imu((900, 900, 900), "scaled_imu2"))
     assert len(held) == 3
-    second = Window(2, 0)
+    second = Window(ADAPTERS[3].proof_streams(2), 0)
     for kind in ("raw_imu", "scaled_imu2", "scaled_imu3"):
         second.add(raw_imu((1, 1, 1), kind))
     assert len(second) == 1

@@ -59,6 +59,18 @@ class Reason(Enum):
     LINK_LOST = (47, "link to the vehicle was lost")
     NOT_SUPPORTED = (48, "upload to this autopilot is not supported yet")
     NOT_RECORDED = (49, "the change could not be put on record first")
+    MAPPING_UNCLEAR = (50, "not clear which stored parameters belong to this compass")
+    TOO_SMALL = (56, "change is too small: this autopilot takes it up only when it restarts")
+    REBOOT_TO_APPLY = (57, "written and read back, but no stream of this autopilot can prove it: reboot it")
+    NOT_COMMITTED = (
+        58,
+        "stored, but the autopilot will still say not calibrated: commit the device id by hand, then reboot",
+    )
+    PERHAPS_NOT_COMMITTED = (
+        59,
+        "stored, but never calibrated before: the autopilot may still say not calibrated",
+    )
+
 
     def __init__(self, number: int, text: str) -> None:
         self.number = number

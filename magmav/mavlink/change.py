@@ -1,63 +1,54 @@
-"""A change of offsets before anything is sent: what may be written, the code, the dry run, the undo.
+"""A change of offsets before anything is sent: whose it is, the code, the dry run, what forbids it, the undo.
 
-ArduPilot only. Offsets are the one thing ever written (S5, S9): no scale, matrix, motor term, orientation,
-use, priority, device id or learning mode.
+Offsets are the one thing ever written (S5, S9): no scale, matrix, motor term, orientation, use, priority, device id or
+learning mode. What the names and units are is the autopilot's adapter's to know.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import re
 import struct
 from collections.abc import Mapping
-from dataclasses import replace
 
 from magmav.core.types import Change, Reason
+from magmav.mavlink.autopilot.adapter import ADAPTERS, Adapter
 from magmav.mavlink.float32 import float32, same
 
 CONFIRM_ABOVE_MG = 150.0
-LEARN, OFFS_MAX = "COMPASS_LEARN", "COMPASS_OFFS_MAX"
-# COMPASS_OFS_X, COMPASS_OFS2_X, COMPASS_OFS3_X, and the other naming scheme's COMPASS1_OFS_X and so on
-_OFFSET = re.compile(r"COMPASS(?:_OFS([23]?)|([123])_OFS)_([XYZ])")
-_DEVICE = re.compile(r"COMPASS(?:_DEV_ID([23]?)|([123])_DEV_ID)")
+
+
+def adapter_for(change: Change) -> Adapter:
+    """The autopilot whose offsets these are. ValueError names what may not be written or does not fit."""
+    why: list[ValueError] = []
+    for adapter in ADAPTERS.values():
+        try:
+            adapter.checked(change)
+        except ValueError as error:
+            why.append(error)
+        else:
+            return adapter
+    # The one that came furthest: a name of its own in the wrong place says more than a name that is unknown.
+    raise max(why, key=lambda error: "nothing else is ever written" not in str(error))
 
 
 def checked(change: Change) -> Change:
     """The same change in exact 32-bit floats. ValueError names what may not be written or does not fit."""
-    sizes = {len(change.names), len(change.old), len(change.new), len(change.step_mg)}
-    if sizes - {1, 2, 3} or len(sizes) != 1:
-        raise ValueError("change: names, old, new and step_mg want the same length, 1 to 3")
-    if len(set(change.names)) != len(change.names):
-        raise ValueError(f"change: a name is there twice in {change.names!r}")
-    for name in change.names:
-        if not _OFFSET.fullmatch(name):
-            raise ValueError(f"change: {name!r} is not a compass offset, and nothing else is ever written")
-    device = _DEVICE.fullmatch(change.device_name)
-    stems = {name[:-1] for name in change.names}
-    belongs = device and {_number(_OFFSET.fullmatch(name)) for name in change.names} == {_number(device)}
-    if len(stems) != 1 or not belongs:
-        raise ValueError(f"change: {change.names!r} and {change.device_name!r} are not of one compass")
-    if change.compass not in (1, 2, 3):
-        raise ValueError(f"change: compass wants 1, 2 or 3, got {change.compass!r}")
-    old, new = tuple(map(float32, change.old)), tuple(map(float32, change.new))
-    return replace(change, old=old, new=new)
-
-
-def _number(match: re.Match[str] | None) -> str:
-    return "" if match is None else match.group(1) or match.group(2) or "1"
-
-
-def triple(change: Change) -> tuple[str, str, str]:
-    """All three offset names of this compass, written or not: their length counts for the limit."""
-    stem = change.names[0][:-1]
-    return f"{stem}X", f"{stem}Y", f"{stem}Z"
+    return adapter_for(change).checked(change)
 
 
 def largest_step_mg(change: Change) -> float:
     """The largest step on any axis; what the change says of itself is not trusted to be large enough."""
-    steps = (abs(n - o) for o, n in zip(change.old, change.new, strict=True))
+    unit_mg = adapter_for(change).unit_mg
+    steps = (unit_mg * abs(n - o) for o, n in zip(change.old, change.new, strict=True))
     return max((*steps, *change.step_mg))
+
+
+def is_too_small(change: Change) -> bool:
+    """The autopilot would not take it up before it restarts."""
+    adapter = adapter_for(change)
+    steps = (n - o for o, n in zip(change.old, change.new, strict=True))
+    return adapter.least_step_mg > 0.0 and adapter.unit_mg * math.hypot(*steps) <= adapter.least_step_mg
 
 
 def confirmation_code(change: Change) -> int:
@@ -72,31 +63,30 @@ def code_needed(change: Change, above_mg: float = CONFIRM_ABOVE_MG) -> int | Non
     return confirmation_code(change) if largest_step_mg(change) > above_mg else None
 
 
-def reads(change: Change) -> tuple[str, ...]:
-    """Parameters that are read afresh before anything is written."""
-    return (*triple(change), change.device_name, LEARN, OFFS_MAX)
-
-
 def dry_run(change: Change, above_mg: float = CONFIRM_ABOVE_MG) -> list[str]:
     """Every message an upload of this change would send, in order, a line each; the code last, if wanted.
 
     Requests are repeated when unanswered. Where the proof fails, the old values are written back the same
     way.
     """
-    change = checked(change)
+    adapter = adapter_for(change)
+    change = adapter.checked(change)
     pairs = list(zip(change.names, change.old, change.new, strict=True))
-    lines = [f"PARAM_REQUEST_READ {name}" for name in reads(change)]
+    lines = [f"PARAM_REQUEST_READ {name}" for name in adapter.reads(change)]
     lines += [f"PARAM_SET {name} {new!r} (now {old!r})" for name, old, new in pairs if not same(old, new)]
     lines += [f"PARAM_REQUEST_READ {name}" for name in change.names]
+    if adapter.proof_streams(change.compass):
+        lines.append("COMMAND_LONG MAV_CMD_RUN_PREARM_CHECKS")
     code = code_needed(change, above_mg)
     return lines if code is None else [*lines, f"a change above {above_mg:g} mG: confirm with code {code}"]
 
 
 def beyond_limit(change: Change, stored: Mapping[str, float], most_mg: float) -> bool:
     """Any axis, or the length of the vector with the axes that stay, is over the limit or not finite."""
+    adapter = adapter_for(change)
     new = dict(zip(change.names, change.new, strict=True))
-    values = tuple(new.get(name, stored.get(name, 0.0)) for name in triple(change))
-    return not all(map(math.isfinite, values)) or not math.hypot(*values) <= most_mg
+    values = tuple(new.get(name, stored.get(name, 0.0)) for name in adapter.triple(change))
+    return not all(map(math.isfinite, values)) or not adapter.unit_mg * math.hypot(*values) <= most_mg
 
 
 def value_refusals(
@@ -107,18 +97,21 @@ def value_refusals(
     Before an upload every value must still be the old one; before a restore either the old or our new one,
     which is what a write that was cut short leaves behind.
     """
+    adapter = adapter_for(change)
     out = []
     device = stored.get(change.device_name)
     if device is not None and not same(device, change.device_id):
         out.append(Reason.DEVICE_CHANGED)
+    if adapter.ambiguous(change, stored):
+        out.append(Reason.MAPPING_UNCLEAR)
     for name, old, new in zip(change.names, change.old, change.new, strict=True):
         value = stored.get(name)
         if value is not None and not same(value, old) and not (undo and same(value, new)):
             out.append(Reason.OFFSETS_CHANGED)
             break
-    if not same(stored.get(LEARN, 0.0), 0.0):
+    if adapter.second_writer(stored):
         out.append(Reason.SECOND_WRITER)
-    limits = [limit for limit in (stored.get(OFFS_MAX), offs_max_mg) if limit is not None]
+    limits = [limit for limit in (adapter.most_mg(stored), offs_max_mg) if limit is not None]
     if not undo and beyond_limit(change, stored, min(limits, default=math.inf)):
         out.append(Reason.BEYOND_LIMIT)
     return tuple(out)

@@ -10,7 +10,6 @@ import math
 
 from magmav.mavlink.codec import Message
 
-_SOURCES = {1: ("RAW_IMU", "SCALED_IMU"), 2: ("SCALED_IMU2",), 3: ("SCALED_IMU3",)}
 ENOUGH = 10
 WINDOW_NS = 2_000_000_000
 FLOOR_MG = 4.0  # whole mG cut toward zero on both sides, and the vehicle never stands perfectly still
@@ -23,14 +22,12 @@ class Window:
     """Distinct corrected readings of one compass since ``since_ns``: mean and standard error, mG, body axes.
 
     ArduPilot repeats a value when asked faster than 10 Hz, so a triple equal to the one before is not news.
-    All zeros is how it says that there is no compass. Two messages carry compass 1: the first seen counts.
+    All zeros is how it says that there is no compass. streams : messages that carry it; the first seen counts.
     """
 
-    def __init__(self, compass: int, since_ns: int) -> None:
-        if compass not in _SOURCES:
-            raise ValueError(f"compass: want 1, 2 or 3, got {compass!r}")
+    def __init__(self, streams: tuple[str, ...], since_ns: int) -> None:
         self.since_ns = since_ns
-        self._sources: tuple[str, ...] = _SOURCES[compass]
+        self._sources = streams
         self._values: list[tuple[int, int, int]] = []
 
     def add(self, message: Message) -> None:

@@ -62,4 +62,5 @@ class Phase(Enum):
     READ_BACK = "reading back"
     SETTLE = "letting the compass settle"
     PROOF = "checking that the field moved as predicted"
+    ARMING = "asking the autopilot whether it would arm"
     DONE = "done"

@@ -1,27 +1,32 @@
-"""Writing offsets to ArduPilot as a transaction, and taking them back: all new, all old, never in between.
+"""Writing offsets to an autopilot as a transaction, and taking them back: all new, all old, never in between.
 
-    PREFLIGHT -> BASELINE -> (on record) -> WRITE -> READ_BACK -> SETTLE -> PROOF -> DONE
+    PREFLIGHT -> BASELINE -> (on record) -> WRITE -> READ_BACK -> SETTLE -> PROOF -> ARMING -> DONE
                                               ^  \\________ retreat ________/
                                               '-> LINGER -> READ_BACK
 
-One vector goes out back to back, right after a heartbeat that says disarmed. There is no atomic write in
-ArduPilot, so a record on disk comes first, every name is read back, and the corrected stream has to move as
-predicted; otherwise the old values are written back with the same care. Whatever happens in between that
-forbids writing (the vehicle arms, the link is lost) stops everything at once: PENDING_RESTORE, to be undone
-at the next disarm by an Upload with ``undoes``. Every wait is bounded, so the machine always ends.
+One vector goes out back to back, right after a heartbeat that says disarmed. No autopilot writes it at once, so a
+record on disk comes first, every name is read back, and the corrected stream has to move as predicted; otherwise the
+old values are written back with the same care. Where no stream shows it (PX4), BASELINE and PROOF fall away and the
+end is WRITTEN_UNPROVEN. Whatever happens in between that forbids writing (the vehicle arms, the link is lost) stops
+everything at once: PENDING_RESTORE, to be undone at the next disarm by an Upload with ``undoes``. Every wait is
+bounded, so the machine always ends.
 
-Results are named by what the vehicle then holds: ALL_NEW or ALL_OLD as read back, in terms of the change,
-for an undo too (an undo that works ends ALL_OLD). REFUSED: nothing was sent.
+Results are named by what the vehicle then holds: ALL_NEW, WRITTEN_UNPROVEN or ALL_OLD as read back, in terms of the
+change, for an undo too (an undo that works ends ALL_OLD). REFUSED: nothing was sent.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.core.types import Change, Reason, UploadResult
 from magmav.mavlink import change as changes
+from magmav.mavlink.arming import MANUAL_STEP, ArmingCheck
+from magmav.mavlink.autopilot.adapter import adapter_of
 from magmav.mavlink.codec import Message, Outgoing
-from magmav.mavlink.exchange import Exchange
+from magmav.mavlink.dialogue import Dialogue
 from magmav.mavlink.float32 import same
 from magmav.mavlink.preflight import is_lost, stop_reasons, wait_reasons
 from magmav.mavlink.proof import Window, moved_as_predicted
@@ -35,7 +40,8 @@ class Upload:
     """One change, or with ``undoes`` (the journal row it undoes) its way back. Feed it everything.
 
     watch : long-lived, may be fed by others too.  confirm : the code, for a change above 150 mG (never asked
-    of an undo).  vehicle : key for the journal.  result : None until the end; ``reasons`` say why.
+    of an undo).  vehicle : key for the journal.  known : parameters heard before, to see two compasses with one id.
+    row : of the journal, once there is one.  result : None until the end; ``reasons`` say why.
     """
 
     def __init__(
@@ -49,8 +55,11 @@ class Upload:
         vehicle: str = "",
         unix_offset_ns: int = 0,
         settings: UploadSettings | None = None,
+        known: Mapping[str, float] | None = None,
     ) -> None:
-        self.change = changes.checked(change)
+        self._adapter = changes.adapter_for(change)
+        self.change = self._adapter.checked(change)
+        self.row: int | None = None
         self.result: UploadResult | None = None
         self.reasons: tuple[Reason, ...] = ()
         self.phase = Phase.IDLE
@@ -73,13 +82,16 @@ class Upload:
             Phase.READ_BACK: self._read_back,
             Phase.SETTLE: self._settle,
             Phase.PROOF: self._proof,
+            Phase.ARMING: self._arming,
         }
-        self._stored: dict[str, float] = {}  # as last heard; a name just written is not known
-        self._ask = Exchange((), 0, 0)
+        self._known = dict(known or {})
+        self._streams = self._adapter.proof_streams(change.compass)
+        self._talk = Dialogue(self._adapter, (0, 0, ""), ())
+        self._arming_check: ArmingCheck | None = None
+        self._ending: UploadResult | None = None  # decided and on record, while ARMING
+        self._were_zero = False
         self._window: Window | None = None
         self._before: Window | None = None
-        self._row: int | None = None
-        self._sent = False  # at least one PARAM_SET
         self._measured = False  # at least one whole window after the write
         self._retreating = False
         self._round = 0
@@ -95,7 +107,12 @@ class Upload:
             back = ", back to the old values" if self._retreating or self._undo else ""
             return self.phase.value + back
         why = "; ".join(reason.text for reason in self.reasons)
-        advice = "reboot or wait half a minute before take-off" if self._sent else ""
+        unproven = self.result is UploadResult.WRITTEN_UNPROVEN
+        advice = "reboot before take-off" if unproven else "reboot or wait half a minute before take-off"
+        if not self._talk.wrote:
+            advice = ""
+        elif {Reason.NOT_COMMITTED, Reason.PERHAPS_NOT_COMMITTED}.intersection(self.reasons):
+            advice = MANUAL_STEP
         return ": ".join((self.result.name, *filter(None, (why, advice))))
 
     def start(self, now_ns: int) -> None:
@@ -108,12 +125,16 @@ class Upload:
             why.append(Reason.HEARTBEAT_OLD)
         else:
             self._pin, self._boots = autopilot.pin, self._watch.presence.boots
-            if autopilot.kind != dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+            if adapter_of(autopilot.kind) is None:
                 why.append(Reason.NOT_SUPPORTED)
-            if autopilot.system != self.change.system:
+            elif autopilot.system != self.change.system or autopilot.kind != self._adapter.kind:
                 why.append(Reason.WRONG_VEHICLE)
         if all(same(self._old[name], self._new[name]) for name in self._old):
             why.append(Reason.NOTHING_TO_DO)
+        elif not self._undo and changes.is_too_small(self.change):
+            why.append(Reason.TOO_SMALL)
+        if self._adapter.ambiguous(self.change, self._known):
+            why.append(Reason.MAPPING_UNCLEAR)
         why += self._value_refusals()
         code = None if self._undo else changes.code_needed(self.change, self._set.confirm_above_mg)
         if code is not None and self._confirm != code:
@@ -123,7 +144,8 @@ class Upload:
             self._end(UploadResult.REFUSED, *why)
             return
         tries = self._set.preflight_ns // self._set.retry_ns
-        self._ask = Exchange(changes.reads(self.change), self._set.retry_ns, tries)
+        self._talk = Dialogue(self._adapter, self._pin, self._adapter.reads(self.change))
+        self._talk.turn_to(self._adapter.reads(self.change), self._set.retry_ns, tries)
         self._enter(Phase.PREFLIGHT, now_ns)
 
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
@@ -133,22 +155,25 @@ class Upload:
         self._watch.on_message(message, route, now_ns)
         if (message.get_srcSystem(), message.get_srcComponent(), route) == self._pin:
             kind = message.get_type()
-            if kind == "PARAM_VALUE":
-                self._heard(message.param_id, message.param_value)
-            elif kind == "PARAM_ERROR" and message.param_id in self._ask.open:
+            if self._arming_check is not None:
+                self._arming_check.on_message(message, now_ns)
+            elif kind == "PARAM_VALUE":
+                asking = self.phase in (Phase.PREFLIGHT, Phase.READ_BACK)
+                self._talk.heard(message, None if asking else self._target if self.phase is Phase.WRITE else {})
+            elif kind == "PARAM_ERROR" and message.param_id in self._talk.asking.open:
                 if self.phase is Phase.PREFLIGHT and message.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST:
                     self._end(UploadResult.REFUSED, Reason.UNKNOWN_PARAM)
             elif self._window is not None and self._watch.still(now_ns):
                 self._window.add(message)
             elif self._window is not None and len(self._window):
-                self._window = Window(self.change.compass, now_ns)
+                self._window = Window(self._streams, now_ns)
         return self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """Do what is due now."""
         if self.phase in (Phase.IDLE, Phase.DONE):
             return []
-        why = self._interruption(now_ns)
+        why = [] if self.phase is Phase.ARMING else self._interruption(now_ns)
         if why:
             self._stop(*why)
         else:
@@ -159,7 +184,7 @@ class Upload:
     def _interruption(self, now_ns: int) -> list[Reason]:
         """Reasons to stop at once, in any phase."""
         why = stop_reasons(self._watch, self._pin, self._boots, now_ns)
-        if not self._sent:
+        if not self._talk.wrote:
             why += self._value_refusals()
         # PREFLIGHT bears a lost link: it has its own, more telling end.
         lost = self.phase is not Phase.PREFLIGHT and is_lost(self._watch, self._set, now_ns)
@@ -169,13 +194,13 @@ class Upload:
 
     def _value_refusals(self) -> tuple[Reason, ...]:
         limit = self._set.offs_max_mg
-        return changes.value_refusals(self.change, self._stored, undo=self._undo, offs_max_mg=limit)
+        return changes.value_refusals(self.change, self._talk.stored, undo=self._undo, offs_max_mg=limit)
 
     # ------------------------------------------------------------ the steps
 
     def _preflight(self, now_ns: int) -> None:
         waiting = wait_reasons(self._watch, self._set, now_ns)
-        if self._ask.open:
+        if self._talk.asking.open:
             waiting.insert(0, Reason.UNKNOWN_PARAM)
         since_ns = self._watch.since_ns
         watched = since_ns is not None and now_ns - since_ns >= self._set.watch_ns
@@ -184,10 +209,13 @@ class Upload:
         elif now_ns - self._since_ns >= self._set.preflight_ns:
             self._end(UploadResult.REFUSED, *(waiting or [Reason.HEARTBEAT_OLD]))
         else:
-            self._request(now_ns)
+            self._out += self._talk.read(now_ns)
 
     def _baseline(self, now_ns: int) -> None:
         window = self._window
+        if not self._streams:
+            self._record(now_ns)
+            return
         if window is not None and window.ready(now_ns):
             self._before = window
             self._record(now_ns)
@@ -202,11 +230,13 @@ class Upload:
         """On disk before the first write (S2)."""
         # A vector that is partly old and partly new moves the stream by an unknown part of the shift.
         start = self._new if self._undo else self._old
-        if not all(same(self._stored[name], value) for name, value in start.items()):
+        stored = self._talk.stored
+        if not all(same(stored[name], value) for name, value in start.items()):
             self._before = None
+        self._were_zero = not any(stored[name] for name in self._adapter.triple(self.change))
         try:
             unix_ns = now_ns + self._unix_offset_ns
-            self._row = self._journal.begin(self.change, unix_ns, self._undoes, self._vehicle)
+            self.row = self._journal.begin(self.change, unix_ns, self._undoes, self._vehicle)
         except BlockingIOError:
             self._end(UploadResult.REFUSED, Reason.BUSY)
         except OSError:
@@ -215,7 +245,7 @@ class Upload:
             self._enter(Phase.WRITE, now_ns)
 
     def _write(self, now_ns: int) -> None:
-        if not self._ask.open or self._ask.spent(now_ns):
+        if not self._talk.asking.open or self._talk.asking.spent(now_ns):
             back = self._retreating or self._undo
             self._enter(Phase.LINGER if back else Phase.READ_BACK, now_ns)
             return
@@ -224,31 +254,23 @@ class Upload:
             self._stop(*not_now)
             return
         age_ns = self._watch.heartbeat_age_ns(now_ns)
-        late = self._ask.untouched and (age_ns is None or age_ns > self._set.first_write_age_ns)
+        late = self._talk.asking.untouched and (age_ns is None or age_ns > self._set.first_write_age_ns)
         if late or not_now:
             return
-        for name in self._ask.due(now_ns):
-            self._ask.asked(name, now_ns)
-            self._stored.pop(name, None)
-            self._sent = True
-            self._say(
-                dialect.MAVLink_param_set_message(
-                    *self._pin[:2], name.encode(), self._target[name], dialect.MAV_PARAM_TYPE_REAL32
-                )
-            )
+        self._out += self._talk.write(self._target, now_ns)
 
     def _linger(self, now_ns: int) -> None:
         if now_ns - self._since_ns >= self._set.linger_ns:
             self._enter(Phase.READ_BACK, now_ns)
 
     def _read_back(self, now_ns: int) -> None:
-        if self._ask.open:
-            if self._ask.spent(now_ns):
+        if self._talk.asking.open:
+            if self._talk.asking.spent(now_ns):
                 self._retreat(Reason.UNKNOWN_PARAM, now_ns)
             else:
-                self._request(now_ns)
+                self._out += self._talk.read(now_ns)
             return
-        stored = {name: self._stored[name] for name in self._target}
+        stored = {name: self._talk.stored[name] for name in self._target}
         if any(not same(v, self._old[n]) and not same(v, self._new[n]) for n, v in stored.items()):
             self._stop(Reason.OFFSETS_CHANGED)
         elif any(not same(value, self._target[name]) for name, value in stored.items()):
@@ -258,7 +280,7 @@ class Upload:
             else:
                 self._retreat(Reason.UNKNOWN_PARAM, now_ns)
         elif self._retreating or self._before is None:
-            self._end(self._arrived())
+            self._arrive(now_ns)
         else:
             self._enter(Phase.SETTLE, now_ns)
 
@@ -272,10 +294,10 @@ class Upload:
             sign = -1.0 if self._undo else 1.0
             x, y, z = (sign * value for value in self.change.shift_b_mg)
             if moved_as_predicted(before, window, (x, y, z)):
-                self._end(self._arrived())
+                self._arrive(now_ns)
                 return
             self._measured = True
-            self._window = Window(self.change.compass, now_ns)  # a late packet may have spoilt this one
+            self._window = Window(self._streams, now_ns)  # a late packet may have spoilt this one
         if now_ns - self._since_ns >= self._set.proof_ns:
             if not self._measured:
                 self.reasons = (*self.reasons, Reason.NO_STREAM)
@@ -287,12 +309,13 @@ class Upload:
         """The one place where the phase changes, but for the end."""
         self.phase, self._since_ns = phase, now_ns
         measuring = phase in (Phase.BASELINE, Phase.PROOF)
-        self._window = Window(self.change.compass, now_ns) if measuring else None
+        self._window = Window(self._streams, now_ns) if measuring else None
         if phase is Phase.WRITE:
-            todo = [n for n, v in self._target.items() if n not in self._stored or not same(self._stored[n], v)]
-            self._ask = Exchange(todo, self._set.retry_ns, self._set.write_tries)
+            held = self._talk.stored
+            todo = [n for n, v in self._target.items() if n not in held or not same(held[n], v)]
+            self._talk.turn_to(todo, self._set.retry_ns, self._set.write_tries)
         elif phase is Phase.READ_BACK:
-            self._ask = Exchange(self._target, self._set.retry_ns, self._set.read_tries)
+            self._talk.turn_to(self._target, self._set.retry_ns, self._set.read_tries)
         if phase is not Phase.PREFLIGHT:
             self._steps[phase](now_ns)
 
@@ -300,19 +323,37 @@ class Upload:
         """Back to the old values. From the way back there is no further way back."""
         self.reasons = (*self.reasons, why)
         if self._undo and why is Reason.UNPROVEN:
-            self._end(self._arrived())
+            self._arrive(now_ns)
         elif self._undo or self._retreating:
             self._stop()
         else:
             self._retreating, self._round, self._target = True, 0, self._old
             self._enter(Phase.WRITE, now_ns)
 
-    def _arrived(self) -> UploadResult:
-        return UploadResult.ALL_OLD if self._target is self._old else UploadResult.ALL_NEW
+    def _arrive(self, now_ns: int) -> None:
+        """Everything read back as it should be. New values still have to please the autopilot's own checks."""
+        if self._target is self._old:
+            self._end(UploadResult.ALL_OLD)
+        elif not self._streams:
+            self._end(UploadResult.WRITTEN_UNPROVEN, Reason.REBOOT_TO_APPLY)
+        else:
+            self._ending = UploadResult.ALL_NEW
+            self._on_record(self._ending)
+            self._arming_check = ArmingCheck(self._pin, now_ns, were_zero=self._were_zero)
+            self._enter(Phase.ARMING, now_ns)
+
+    def _arming(self, now_ns: int) -> None:
+        check = self._arming_check
+        if check is None or self._ending is None:
+            raise AssertionError("ARMING is entered by _arrive")
+        if not check.done(now_ns) and not stop_reasons(self._watch, self._pin, self._boots, now_ns):
+            self._out += check.poll(now_ns)
+        else:
+            self._end(self._ending, *([] if check.reason is None else [check.reason]))
 
     def _stop(self, *why: Reason) -> None:
         """No further write. What was sent stays on record to be undone at the next disarm."""
-        if not self._sent:
+        if not self._talk.wrote:
             self._end(UploadResult.REFUSED, *why)
             return
         self._end(UploadResult.PENDING_RESTORE, *why)
@@ -323,27 +364,12 @@ class Upload:
         self.phase, self._window, self._out = Phase.DONE, None, []
         self.reasons = tuple(dict.fromkeys((*self.reasons, *why)))
         self.result = result
-        if self._row is not None:
+        if self._ending is None or why:
+            self._on_record(result)
+
+    def _on_record(self, result: UploadResult) -> None:
+        if self.row is not None:
             try:
-                self._journal.finish(self._row, result, self.reasons)
+                self._journal.finish(self.row, result, self.reasons)
             except OSError:
                 self.reasons = (*self.reasons, Reason.NOT_RECORDED)  # stays pending on record, which is safe
-
-    # ------------------------------------------------------------ parameters
-
-    def _heard(self, name: str, value: float) -> None:
-        if name not in changes.reads(self.change):
-            return
-        self._stored[name] = value
-        asking = self.phase in (Phase.PREFLIGHT, Phase.READ_BACK)
-        written = self.phase is Phase.WRITE and name in self._target and same(value, self._target[name])
-        if asking or written:
-            self._ask.answered(name)
-
-    def _request(self, now_ns: int) -> None:
-        for name in self._ask.due(now_ns):
-            self._ask.asked(name, now_ns)
-            self._say(dialect.MAVLink_param_request_read_message(*self._pin[:2], name.encode(), -1))
-
-    def _say(self, message: Message) -> None:
-        self._out.append(Outgoing(message, self._pin[2]))

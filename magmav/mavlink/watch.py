@@ -81,6 +81,8 @@ class Watch:
             self._speed(message.groundspeed, now_ns)
         elif kind in _IMU:
             self._gyro(max(abs(message.xgyro), abs(message.ygyro), abs(message.zgyro)) / 1000.0, now_ns)
+        elif kind == "HIGHRES_IMU":  # rad/s here, thousandths there
+            self._gyro(max(abs(message.xgyro), abs(message.ygyro), abs(message.zgyro)), now_ns)
 
     def armed(self, now_ns: int) -> bool:
         """The last heartbeat over the pinned route says so, or another route did in the last five seconds."""
@@ -133,7 +135,7 @@ class Watch:
 
     def _gyro(self, rads: float, now_ns: int) -> None:
         fresh = _within(self._gyro_ns, now_ns, _GAP_NS)
-        if rads > STILL_RADS:
+        if not rads <= STILL_RADS:
             self._still_since_ns = None
         elif self._still_since_ns is None or not fresh:
             self._still_since_ns = now_ns
