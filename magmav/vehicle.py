@@ -26,6 +26,7 @@ from magmav.core.types import (
     ZERO3,
     AttitudeReading,
     AxisState,
+    CalibrationReading,
     CurrentReading,
     Estimate,
     FieldModel,
@@ -48,8 +49,7 @@ from magmav.core.types import (
     Verdict,
     vec3,
 )
-from magmav.mavlink.autopilot.ardupilot import Calibrations
-from magmav.mavlink.autopilot.px4 import Px4Calibrations
+from magmav.mavlink.autopilot.books import Books
 from magmav.mavlink.autopilot.stored import StoredCalibrations
 from magmav.settings import Settings
 
@@ -57,7 +57,6 @@ _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is st
 _SAY_FROZEN_NS = 1_000_000_000
 _DOUBTED_S = 5.0  # after a sudden change the answer is still on its way: the gyro holds the own yaw
 _WRONG_RAD = math.radians(25.0)  # own yaw so far off is wrong: it is moved slowly and may have begun so
-_ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 
 
 Tap = Callable[[Sample, Circumstances, tuple[int, int]], None]
@@ -91,7 +90,7 @@ class Vehicle:
         self.assembler = Assembler(system, settings.attitude.own)
         self.phase = Phase()
         self.causes = Causes()
-        self._books = _books()
+        self._books = Books()
         self.former: Boot | None = None
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[str] = Counter()
@@ -114,7 +113,7 @@ class Vehicle:
         self.settings = settings
         self.learning = settings.learn.on
         for channel in self.channels.values():
-            channel.limits = limits(settings)
+            channel.limits, channel.steady_s = limits(settings), settings.gate.steady_s
 
     def step(self, r: Reading, t_ns: int, unix_ns: int) -> Record | None:
         """Hand one reading to whom it concerns."""
@@ -132,13 +131,13 @@ class Vehicle:
             case MotionReading():
                 self.phase.moving(r)
             case VehicleReading():
-                self.autopilot = r.autopilot
+                self._by_the_rules_of(r.autopilot)
                 self.calibrations.armed(r.armed)
                 self.phase.vehicle(r, self._now_ns())
             case LandedReading():
                 self.phase.landed(r)
-            case ParamReading():
-                self._param(r)
+            case ParamReading() | CalibrationReading():
+                self._stored(r)
             case ThrottleReading():
                 self._throttle = r.share
                 self.calibrations.throttle(r.share)
@@ -151,15 +150,17 @@ class Vehicle:
         self._after_reboot()
         return None
 
-    def _param(self, r: ParamReading) -> None:
+    def _by_the_rules_of(self, autopilot: int) -> None:
+        """What was undone by another autopilot's rules before does not mix with what is now."""
+        was, self.autopilot = self.calibrations, autopilot
+        if self.calibrations is not was:
+            self._epochs.clear()
+
+    def _stored(self, r: ParamReading | CalibrationReading) -> None:
         """Where a correction changes, what comes next teaches nothing; new offsets for old are handed over exactly."""
         held, now_ns = self.calibrations, self._now_ns()
         before = {c: (held.epoch(c), held.offsets(c)) for c in self.channels}
-        changed: tuple[int, ...] = ()
-        for book in self._books.values():
-            its = book.param(r)
-            changed = its if book is held else changed
-        for compass in changed:
+        for compass in self._books.take(r, self.autopilot):
             self.settle(compass)
             epoch, old = before.get(compass, (None, None))
             new = held.offsets(compass)
@@ -168,7 +169,9 @@ class Vehicle:
 
     def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
         held, compass, axes = self.calibrations, r.compass, self.settings.compass.axes
-        held.sensor(compass, r.device_id, r.source)
+        if not held.sensor(compass, r.device_id, r.source):
+            self.counts["mag: same compass in a better message"] += 1
+            return None
         if axes == 2:
             r = replace(r, field_b_mg=vec3((*r.field_b_mg[:2], 0.0), "field"))
         channel = self._channel(compass)
@@ -204,7 +207,7 @@ class Vehicle:
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
         self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
-        finding = self._doubted(finding, self.causes.refuses(compass))
+        finding = self._doubted(finding, held.refuses(compass) or self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
             t_ns=t_ns,
@@ -304,7 +307,7 @@ class Vehicle:
     @property
     def calibrations(self) -> StoredCalibrations:
         """What this vehicle stores for its compasses, by the rules of its autopilot (ArduPilot's until it says)."""
-        return self._books.get(self.autopilot, self._books[_ARDUPILOT])
+        return self._books.of(self.autopilot)
 
     def _now_ns(self) -> int:
         return self.assembler.clock.latest_ns or 0
@@ -364,7 +367,7 @@ class Vehicle:
         self.phase = Phase()
         self.phase.kind = kind
         self.causes = Causes()
-        self._books = _books()
+        self._books = Books()
         self._epochs.clear()
         self._settle_until_ns.clear()
         self._handovers.clear()
@@ -374,11 +377,6 @@ class Vehicle:
         for channel in self.channels.values():
             if not channel.keeps:
                 channel.restart()
-
-
-def _books() -> dict[int, StoredCalibrations]:
-    """One of each kind: parameters may be heard before the heartbeat that says whose they are."""
-    return {_ARDUPILOT: Calibrations(), _PX4: Px4Calibrations()}
 
 
 def new_channel(settings: Settings, name: str | None = None, make: Callable[[], Estimator] | None = None) -> Channel:

@@ -148,7 +148,7 @@ def test_a_sensor_uses_the_slot_that_names_it(n):
     [
         (CORRECTED, 0),
         (CORRECTED, DEVICE + 1),
-        ("SCALED_IMU", DEVICE),
+        ("SCALED_IMU raw", DEVICE),
         ("HIGHRES_IMU", 0),
         ("vehicle_magnetometer less bias", DEVICE),
     ],
@@ -157,7 +157,7 @@ def test_what_is_not_known_to_be_corrected_is_left_and_relative(source, device):
     held = holding(slot(0, OFF=(0.1, 0.2, 0.3), SCALE=(2.0, 1.0, 1.0)), source, device)
     assert not held.known(1) and held.assumed(1) and held.offsets(1) is None and held.stored(1) == {}
     assert held.undo(1, RAW, source) == pytest.approx(RAW)
-    assert held.corrected(1, RAW, source) is RAW
+    assert np.array_equal(held.corrected(1, RAW, source), RAW)
     assert held.shaping(1).matrix == pytest.approx(np.eye(3)) and held.undoable(1)
     assert held.epoch(1) == 0
 

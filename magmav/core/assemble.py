@@ -22,8 +22,11 @@ _GAP_S = 0.5
 _SOURCE_SILENT_NS = 2_000_000_000
 _REFRESH_S = 0.1  # ArduPilot's refresh; a slower stream only shows it more rarely
 _AVERAGED_S = 0.07
-# PX4's logs stamp a value with the time it was measured, so it has no age.
-_STAMPED = frozenset({"sensor_mag", "vehicle_magnetometer", "vehicle_magnetometer less bias", "sensor_combined"})
+# PX4's logs stamp a value with the time it was measured, so it has no age; on a link it sends the newest there is.
+_STAMPED = frozenset({
+    "sensor_mag", "vehicle_magnetometer", "vehicle_magnetometer less bias", "sensor_combined",
+    "SCALED_IMU raw", "SCALED_IMU2 raw", "SCALED_IMU3 raw",
+})  # fmt: skip
 # ArduPilot writes its log right after the compass was read: a value has not waited.
 _AT_ONCE = frozenset({"MAG", "MAG2", "MAG3"})
 _PREFERENCE = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "HIGHRES_IMU")

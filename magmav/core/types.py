@@ -174,6 +174,16 @@ class ParamReading:
     count: int
 
 
+@dataclass(frozen=True, slots=True)
+class CalibrationReading:
+    """The calibration an autopilot says it applies to one compass (PX4's MAG_CAL_REPORT), in its own units and axes."""
+
+    system: int
+    compass: int
+    offsets: tuple[float, float, float]
+    matrix: tuple[float, float, float, float, float, float]  # xx, yy, zz, xy, xz, yz
+
+
 Reading = (
     MagReading
     | InertialReading
@@ -186,6 +196,7 @@ Reading = (
     | VehicleReading
     | LandedReading
     | ParamReading
+    | CalibrationReading
 )
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from magmav.core.rotation import euler_from_quaternion
 from magmav.core.types import (
     AttitudeReading,
+    CalibrationReading,
     CurrentReading,
     InertialReading,
     Landed,
@@ -29,10 +30,13 @@ from magmav.core.types import (
     vec3,
 )
 from magmav.mavlink.codec import Message
+from magmav.mavlink.values import bytewise, cast
 
 _G = 9.80665
 _MS, _US = 1_000_000, 1_000
-_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+_PX4, _NO_AUTOPILOT = 12, 8  # MAV_AUTOPILOT_PX4, MAV_AUTOPILOT_INVALID
+_SAYS_BYTEWISE, _SAYS_CAST = 16, 131072  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE and _C_CAST
+_ONLY_PX4 = ("CAL_", "SENS_")  # names that tell whose they are before a heartbeat does
 _EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
 # No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
 _MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
@@ -45,6 +49,8 @@ class Decoder:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._autopilot: dict[int, int] = {}  # system -> component of its autopilot
+        self._kind: dict[int, int] = {}  # system -> MAV_AUTOPILOT
+        self._bytewise: dict[int, bool] = {}  # system -> how it encodes parameters, where it says so
         self._how: dict[str, Callable[[Message, int], list[Reading]]] = {
             "RAW_IMU": self._imu,
             "SCALED_IMU": self._imu,
@@ -62,12 +68,19 @@ class Decoder:
             "HEARTBEAT": self._heartbeat,
             "EXTENDED_SYS_STATE": self._landed,
             "PARAM_VALUE": self._param,
+            "AUTOPILOT_VERSION": self._version,
+            "MAG_CAL_REPORT": self._report,
         }
 
     @property
     def wanted(self) -> frozenset[str]:
         """Names of the messages that are read."""
         return frozenset(self._how)
+
+    def forget(self, system: int) -> None:
+        """Its autopilot may be another component, or another autopilot, from now on."""
+        for told in (self._autopilot, self._kind, self._bytewise):
+            told.pop(system, None)
 
     def readings(self, message: Message) -> list[Reading]:
         """What this message says, or an empty list, counted, when it says nothing usable."""
@@ -106,7 +119,9 @@ class Decoder:
             self.counts[f"{kind}: no compass (all zero)"] += 1
         else:
             field = vec3((m.xmag, m.ymag, m.zmag), "field")
-            out.append(MagReading(system, _COMPASS_OF[kind], kind, boot_ns, field))
+            # The same message, but PX4 sends the sensor's own field in the sensor's own axes (autopilots.md 4.1).
+            source = f"{kind} raw" if self._kind.get(system) == _PX4 else kind
+            out.append(MagReading(system, _COMPASS_OF[kind], source, boot_ns, field))
         return out
 
     def _highres(self, m: Message, system: int) -> list[Reading]:
@@ -181,6 +196,7 @@ class Decoder:
         if self._autopilot.setdefault(system, component) != component:
             self.counts["second autopilot component"] += 1
             return []
+        self._kind[system] = m.autopilot
         armed = bool(m.base_mode & 128)
         return [VehicleReading(system, component, m.autopilot, m.type, armed, m.system_status)]
 
@@ -190,10 +206,37 @@ class Decoder:
         return [LandedReading(system, Landed(m.landed_state))]
 
     def _param(self, m: Message, system: int) -> list[Reading]:
-        if m.param_id == "_HASH_CHECK" or not math.isfinite(m.param_value):
+        if m.param_id == "_HASH_CHECK":  # of PX4's parameters, and none itself
             return []
-        component = m.get_srcComponent()
-        return [ParamReading(system, component, m.param_id, m.param_value, m.param_index, m.param_count)]
+        value = bytewise(m) if self._by_bytes(system, m.param_id) else cast(m)
+        if value is None:
+            self.counts["PARAM_VALUE: not a number"] += 1
+            return []
+        return [ParamReading(system, m.get_srcComponent(), m.param_id, value, m.param_index, m.param_count)]
+
+    def _by_bytes(self, system: int, name: str) -> bool:
+        """Is an integer sent as its bytes? As the vehicle says; else by its autopilot; else by whose name it is."""
+        if system in self._bytewise:
+            return self._bytewise[system]
+        kind = self._kind.get(system)
+        return name.startswith(_ONLY_PX4) if kind is None else kind == _PX4
+
+    def _version(self, m: Message, system: int) -> list[Reading]:
+        says_bytes, says_cast = bool(m.capabilities & _SAYS_BYTEWISE), bool(m.capabilities & _SAYS_CAST)
+        if says_bytes != says_cast:
+            self._bytewise[system] = says_bytes
+        return []
+
+    def _report(self, m: Message, system: int) -> list[Reading]:
+        """On PX4 what it applies; on ArduPilot the end of a calibration that runs, which is for others to watch."""
+        values = (
+            (m.ofs_x, m.ofs_y, m.ofs_z), (m.diag_x, m.diag_y, m.diag_z, m.offdiag_x, m.offdiag_y, m.offdiag_z)
+        )  # fmt: skip
+        if self._kind.get(system) != _PX4 or m.compass_id > 2:
+            return []
+        if not all(map(math.isfinite, (*values[0], *values[1]))):
+            raise ValueError("calibration")
+        return [CalibrationReading(system, m.compass_id + 1, *values)]
 
 
 def _within(most: float, value: tuple[float, float, float], name: str) -> Vec3:

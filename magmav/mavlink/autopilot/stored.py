@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from magmav.core.types import NO_SHAPING, ParamReading, Shaping, Vec3
+from magmav.core.types import NO_SHAPING, CalibrationReading, ParamReading, Reason, Shaping, Vec3
 
 _MOST_MG = 32767.0  # what RAW_IMU can carry
 _LEAST_GAIN, _MOST_GAIN = 0.05, 20.0
@@ -27,6 +27,19 @@ def only_offsets_moved(before: tuple[object, ...], after: tuple[object, ...]) ->
     return None not in (before[0], after[0]) and before[0] != after[0] and before[1:] == after[1:]
 
 
+class Wish(NamedTuple):
+    """New offsets of one compass in the autopilot's own names, units, sign and axes, exact 32-bit floats.
+
+    left_b_mg : (3,) the offsets in body axes, to be added, as they will be with these 32-bit values.
+    """
+
+    device_name: str
+    names: tuple[str, ...]
+    old: tuple[float, ...]
+    new: tuple[float, ...]
+    left_b_mg: Vec3
+
+
 class StoredCalibrations(Protocol):
     """What one vehicle holds for its compasses, as far as it has been heard, and how to undo it.
 
@@ -40,8 +53,15 @@ class StoredCalibrations(Protocol):
         """Take one parameter; the compasses whose correction it changed."""
         ...
 
-    def sensor(self, compass: int, device_id: int, source: str) -> None:
-        """This compass's readings come from this device (0: not said), through this message."""
+    def report(self, r: CalibrationReading) -> tuple[int, ...]:
+        """Take what the autopilot says it applies; the compasses whose correction we see otherwise now."""
+        ...
+
+    def sensor(self, compass: int, device_id: int, source: str) -> bool:
+        """This compass's readings come from this device (0: not said), through this message.
+
+        False: another message tells the same better, and this one is to be left alone.
+        """
         ...
 
     def armed(self, armed: bool) -> None:
@@ -74,6 +94,26 @@ class StoredCalibrations(Protocol):
 
     def changed(self, compass: int) -> bool:
         """True when somebody changed the correction after it was known."""
+        ...
+
+    def refuses(self, compass: int) -> Reason | None:
+        """Why nothing may be written though values are known: it is not clear whose they are (S6). None: clear."""
+        ...
+
+    def names(self, compass: int) -> tuple[str, str, str, str]:
+        """Offsets X, Y, Z and device id, as this vehicle calls them, as far as it is known."""
+        ...
+
+    def wish(self, compass: int, offsets_b_mg: Vec3, write: tuple[bool, bool, bool]) -> Wish:
+        """What must be stored for these offsets, by names that the body axes in ``write`` have a part in.
+
+        Only where ``known``.
+        """
+        ...
+
+    @property
+    def unit_mg(self) -> float:
+        """One unit of a stored offset, mG."""
         ...
 
     def device_id(self, compass: int) -> int:
