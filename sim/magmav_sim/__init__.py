@@ -1,7 +1,7 @@
-"""A vehicle on the other end of the wire: flown by JSBSim, speaking MAVLink as ArduPilot 4.5 does.
+"""A vehicle on the other end of the wire: flown by JSBSim, speaking MAVLink as ArduPilot 4.5 or PX4 does.
 
     scenario -> mission (pilot, JSBSim) -> State -> world (field, iron, noise) -> autopilot -> frames
-    frames -> protocol -> autopilot
+    frames -> protocol -> autopilot (ardupilot, px4)
 
 It shares no code with ``magmav.core``, so that a sign error cannot cancel: field in mG, body axes
 forward-right-down, earth north-east-down, angles rad. All of it is deterministic; only a link has a clock.

@@ -19,7 +19,7 @@ from typing import NoReturn
 from magmav.link import Link, LinkError
 from magmav.link.open import open_link
 from magmav_sim.recorder import Recorder, kinds, recordable, unattended
-from magmav_sim.scenario import ScenarioError
+from magmav_sim.scenario import ScenarioError, has_second_route, with_autopilot
 from magmav_sim.scenario_file import load_scenario, scenario_files
 from magmav_sim.serve import serve
 from magmav_sim.truth import TruthLog, summary
@@ -42,11 +42,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _WRONG if leave.code else 0
     try:
         scenario = load_scenario(options.scenario)
+        if options.autopilot is not None:
+            scenario = with_autopilot(scenario, options.autopilot)
         simulation = Simulation(scenario if options.to else unattended(scenario), options.seed)
     except ScenarioError as error:
         return _fail(_NO_INPUT, str(error), options.json)
     try:
         link = None if options.to is None else open_link(options.to, tick_s=_TICK_S)
+        second = None if link is None or not has_second_route(scenario) else open_link(options.to, tick_s=_TICK_S)
     except LinkError as error:
         return _fail(_NO_LINK, str(error), options.json)
     first = simulation.truth
@@ -55,6 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         truth = None
         if link is not None:
             stack.callback(link.close)
+        if second is not None:
+            stack.callback(second.close)
         try:
             if options.truth is not None:
                 truth = stack.enter_context(TruthLog(options.truth, simulation))
@@ -67,7 +72,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if link is None:
                 _fly(simulation, truth, stopped)
             else:
-                serve(link, simulation, options.speed, truth, stopped.is_set)
+                serve(link, simulation, options.speed, truth, stopped.is_set, second)
+        except ValueError as error:
+            return _fail(_WRONG, f"--write: {error}", options.json)
         except FileExistsError as error:
             return _fail(_NO_INPUT, f"--write {error.filename}: is there already; name another file", options.json)
         except OSError as error:
@@ -98,7 +105,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser(as_json: bool) -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="magmav sim", description="Fly a simulated vehicle that speaks MAVLink as ArduPilot 4.5 does."
+        prog="magmav sim", description="Fly a simulated vehicle that speaks MAVLink as ArduPilot 4.5 or PX4 does."
     )
     parser.as_json = as_json
     parser.add_argument("--json", action="store_true", help="at the end, what was true, as JSON")
@@ -121,6 +128,7 @@ def _parser(as_json: bool) -> argparse.ArgumentParser:
         help="times real time, or max: as answers to PING allow",
     )
     parser.add_argument("--truth", type=Path, metavar="DIR", help="write truth.csv and truth.json there")
+    parser.add_argument("--autopilot", choices=("ardupilot", "px4"), help="instead of the scenario's own")
     parser.add_argument("--seed", type=_seed, metavar="N", help="instead of the scenario's own")
     return parser
 

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 from magmav_sim.faults import Vector
+from magmav_sim.mounting import rotation_matrix
 from magmav_sim.parameters import Parameters, compass_name
-from magmav_sim.world import rotation_matrix
 
 _LEAST_SCALE, _MOST_SCALE = 1 / 1.5, 1.5
 

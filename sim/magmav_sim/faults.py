@@ -74,13 +74,65 @@ class Reboot(Fault, frozen=True, kw_only=True, tag="reboot"):
 
 
 class DeviceId(Fault, frozen=True, kw_only=True, tag="device_id"):
-    """Another sensor is found where this compass was: COMPASS_DEV_ID changes."""
+    """Another sensor is found where this compass was: ArduPilot shows it as COMPASS_DEV_ID; no slot of PX4
+    names it."""
 
     compass: CompassNumber
     device_id: int
 
 
-AnyFault = IronStep | Drift | Frozen | Absent | Deaf | NoEffect | ArmsAfterSets | Reboot | DeviceId
+class Slow(Fault, frozen=True, kw_only=True, tag="slow"):
+    """What is asked by parameter messages and commands is done at once, but the answers come seconds later."""
+
+    seconds: Annotated[float, msgspec.Meta(gt=0)] = 3.0
+
+
+class RebootAfterSets(Fault, frozen=True, kw_only=True, tag="reboot_after_sets"):
+    """The autopilot restarts right after it echoed the n-th PARAM_SET; ``lost``: before that value was saved."""
+
+    sets: Annotated[int, msgspec.Meta(ge=1)]
+    lost: bool = False
+
+
+class SecondWriter(Fault, frozen=True, kw_only=True, tag="second_writer"):
+    """Somebody else stores a value: at ``at_s``, or right after the n-th PARAM_SET that was heard.
+
+    echoed : the new value is told to everybody, as after a PARAM_SET on another link; else nothing is said.
+    """
+
+    name: str
+    value: float
+    sets: Annotated[int, msgspec.Meta(ge=1)] | None = None
+    echoed: bool = False
+
+
+class Signed(Fault, frozen=True, kw_only=True, tag="signed"):
+    """The vehicle signs what it sends (MAVLink 2) and believes only what is signed with the same key.
+
+    key : 32 bytes as 64 hexadecimal digits.
+    """
+
+    key: Annotated[str, msgspec.Meta(pattern="^[0-9a-fA-F]{64}$")]
+    link_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 7
+
+
+class SecondRoute(Fault, frozen=True, kw_only=True, tag="second_route"):
+    """Somebody on another route says to be this autopilot.
+
+    armed, landed : what its heartbeat and its EXTENDED_SYS_STATE claim.  echoes : it answers for parameters, as
+    though every write had been stored.  triggers : it asks component 191 to upload for this compass (0: it does not).
+    """
+
+    armed: bool = False
+    landed: bool = True
+    echoes: bool = True
+    triggers: Annotated[int, msgspec.Meta(ge=0, le=3)] = 0
+
+
+AnyFault = (
+    IronStep | Drift | Frozen | Absent | Deaf | NoEffect | ArmsAfterSets | Reboot | DeviceId
+    | Slow | RebootAfterSets | SecondWriter | Signed | SecondRoute
+)  # fmt: skip
 
 
 def iron_at(faults: Iterable[AnyFault], compass: int, t_s: float) -> Vector:

@@ -10,6 +10,7 @@ from magmav.link import Packet
 from magmav_sim.vehicle import Simulation
 
 ROUTE = "sim:vehicle"
+SECOND_ROUTE = "sim:second"
 
 
 class SimulatedLink:
@@ -41,10 +42,17 @@ class SimulatedLink:
                 yield Packet(sim.elapsed_ns, data, ROUTE)
                 if self._closed:
                     return
+            for data in sim.second_route():
+                self.counts["packets in"] += 1
+                yield Packet(sim.elapsed_ns, data, SECOND_ROUTE)
             yield Packet(sim.elapsed_ns, b"", "")
 
     def send(self, data: bytes, route: str = "") -> None:
-        """To the vehicle, which reacts in the next tick. A route that is not the vehicle's is counted."""
+        """To the vehicle, which reacts in the next tick. A route that is not the vehicle's is counted;
+        the second one takes everything and does nothing with it."""
+        if route == SECOND_ROUTE:
+            self.counts["packets to the second route"] += 1
+            return
         if route not in ("", ROUTE):
             self.counts["unknown route"] += 1
             return

@@ -1,4 +1,4 @@
-"""What is in each message the autopilot sends: units, casts and invalid values as ArduPilot 4.5 has them."""
+"""What is in each message ArduPilot sends: units, casts and invalid values as 4.5 has them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _G = 9.80665
 
 
-def _i16(value: float) -> int:
+def i16(value: float) -> int:
     """C's cast: towards zero. (The cast of a value beyond int16 is undefined in C; here it wraps.)"""
     return (int(value) + 32768) % 65536 - 32768
 
@@ -23,15 +23,15 @@ def _inertial(a: Autopilot, compass: int) -> tuple[int, ...]:
     s, bias = a.state, a.gyro_bias_rads
     field = a.published_mg[compass - 1] if compass <= len(a.published_mg) else (0.0, 0.0, 0.0)
     return (
-        _i16((s.force_x_mss + a.jitter()) * 1000 / _G),
-        _i16((s.force_y_mss + a.jitter()) * 1000 / _G),
-        _i16((s.force_z_mss + a.jitter()) * 1000 / _G),
-        _i16((s.p_rads + bias[0]) * 1000),
-        _i16((s.q_rads + bias[1]) * 1000),
-        _i16((s.r_rads + bias[2]) * 1000),
-        _i16(field[0]),
-        _i16(field[1]),
-        _i16(field[2]),
+        i16((s.force_x_mss + a.jitter()) * 1000 / _G),
+        i16((s.force_y_mss + a.jitter()) * 1000 / _G),
+        i16((s.force_z_mss + a.jitter()) * 1000 / _G),
+        i16((s.p_rads + bias[0]) * 1000),
+        i16((s.q_rads + bias[1]) * 1000),
+        i16((s.r_rads + bias[2]) * 1000),
+        i16(field[0]),
+        i16(field[1]),
+        i16(field[2]),
     )
 
 
@@ -81,7 +81,7 @@ def _position(a: Autopilot) -> Any:
     heading = round(math.degrees(a.yaw_rad % math.tau) * 100) % 36000
     return dialect.MAVLink_global_position_int_message(
         a.boot_ms, round(lat * 1e7), round(lon * 1e7), round((home.alt_m + s.height_m) * 1000),
-        round(s.height_m * 1000), _i16(s.vn_mps * 100), _i16(s.ve_mps * 100), _i16(s.vd_mps * 100), heading,
+        round(s.height_m * 1000), i16(s.vn_mps * 100), i16(s.ve_mps * 100), i16(s.vd_mps * 100), heading,
     )  # fmt: skip
 
 
@@ -134,9 +134,15 @@ def _raw_imu(a: Autopilot) -> Any:
 
 def _version(a: Autopilot) -> Any:
     capabilities = 0x0001 | 0x0002 | 0x2000  # mission float, parameters as C casts, MAVLink 2
+    # send_autopilot_version leaves uid at zero and says who the board is in uid2.
     return dialect.MAVLink_autopilot_version_message(
-        capabilities, 0x040507FF, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, a.uid
+        capabilities, 0x040507FF, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0, uid2(a)
     )
+
+
+def uid2(a: Autopilot) -> bytes:
+    """The board's number in 12 of 18 bytes."""
+    return a.uid.to_bytes(12, "little") + bytes(6)
 
 
 BUILDERS: dict[str, Callable[[Autopilot], Any]] = {
@@ -157,6 +163,3 @@ BUILDERS: dict[str, Callable[[Autopilot], Any]] = {
     "AUTOPILOT_VERSION": _version,
 }
 """Message name to the function that builds it; None where the vehicle has nothing to say."""
-
-NAMES = {kind.id: name for name in BUILDERS if (kind := getattr(dialect, f"MAVLink_{name.lower()}_message"))}
-"""MAVLink message number to name, for the messages this autopilot can send."""

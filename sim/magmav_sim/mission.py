@@ -91,7 +91,7 @@ class Mission:
 
     def _fly(self, flight: Flight) -> Frames:
         a, scenario = self._a, self._scenario
-        a.mode = 3 if a.quad else 10
+        a.mode = a.flying_mode
         a.landed_state = dialect.MAV_LANDED_STATE_TAKEOFF
         a.note("takeoff")
         first = flight.pattern[0]
@@ -110,7 +110,7 @@ class Mission:
         a.landed_state = dialect.MAV_LANDED_STATE_ON_GROUND
         yield from self._stand(_READY_S)
         a.disarm()
-        a.mode = 0
+        a.mode = a.resting_mode
         self.busy = False
 
     def _airborne(self, flight: Flight, height_m: float) -> Frames:

@@ -1,10 +1,11 @@
-"""The autopilot's parameter table: ArduPilot's names, types and manners of storing a value."""
+"""The autopilot's parameter table: names, types and manners of storing a value; ArduPilot's rows, old names or new."""
 
 from __future__ import annotations
 
 import math
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 INT8, INT16, INT32, REAL32 = 2, 4, 6, 9
 _BIGGEST_FLOAT32 = 3.4028234663852886e38
@@ -62,14 +63,34 @@ _OTHERS: tuple[tuple[str, int, float], ...] = (
 ("STAT_BOOTCNT", INT16, 17), )  # fmt: skip
 
 
+_NUMBERED = re.compile(
+    r"COMPASS_(?P<stem>OFS|DIA|ODI|MOT|SCALE|USE|ORIENT|DEV_ID|EXTERN)(?P<number>[23]?)(?P<axis>_[XYZ])?"
+)
+
+
+def new_name(name: str) -> str:
+    """The name in the newer scheme: COMPASS2_OFS_X for COMPASS_OFS2_X; what is not of one compass keeps its name."""
+    if name == "COMPASS_EXTERNAL":
+        return "COMPASS1_EXTERN"
+    found = _NUMBERED.fullmatch(name)
+    return name if found is None else f"COMPASS{found['number'] or 1}_{found['stem']}{found['axis'] or ''}"
+
+
 class Parameters:
     """Name to (type, value), in list order. Values are what fits the type: float32, or a whole number in
-    range."""
+    range.
 
-    def __init__(self) -> None:
+    rows : (name, type, default); ArduPilot's where none are given.  renamed : say ArduPilot's names in the newer
+    scheme. Inside the simulator the old names find the values all the same; ``in`` knows only what is said.
+    """
+
+    def __init__(self, rows: Iterable[tuple[str, int, float]] | None = None, *, renamed: bool = False) -> None:
         self._kinds: dict[str, int] = {}
         self._values: dict[str, float] = {}
-        for name, kind, value in (*_OTHERS, *_compass_rows()):
+        self._said: dict[str, str] = {}
+        for old, kind, value in (*_OTHERS, *_compass_rows()) if rows is None else rows:
+            name = new_name(old) if renamed else old
+            self._said[old] = name
             self._kinds[name] = kind
             self.put(name, value)
         self.names = list(self._kinds)
@@ -82,11 +103,15 @@ class Parameters:
         return len(self.names)
 
     def __getitem__(self, name: str) -> float:
-        return self._values[name]
+        return self._values[self._said.get(name, name)]
+
+    def said(self, name: str) -> str:
+        """What this parameter is called on the wire."""
+        return self._said.get(name, name)
 
     def kind(self, name: str) -> int:
         """MAV_PARAM_TYPE."""
-        return self._kinds[name]
+        return self._kinds[self._said.get(name, name)]
 
     def index(self, name: str) -> int:
         """Place in the list."""
@@ -95,6 +120,7 @@ class Parameters:
     def put(self, name: str, value: float) -> None:
         """Store a value as ArduPilot does, without any check of range. ValueError on an unknown name or
         NaN."""
+        name = self._said.get(name, name)
         kind = self._kinds.get(name)
         if kind is None:
             raise ValueError(f"parameters: no parameter {name!r}")
@@ -108,5 +134,5 @@ class Parameters:
 
     def vector(self, stem: str, compass: int) -> tuple[float, float, float]:
         """The three axes of a compass parameter."""
-        x, y, z = (self._values[compass_name(stem, compass, axis)] for axis in "XYZ")
+        x, y, z = (self[compass_name(stem, compass, axis)] for axis in "XYZ")
         return x, y, z

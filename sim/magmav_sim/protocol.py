@@ -1,18 +1,20 @@
-"""How the autopilot answers: parameters, commands, stream requests, pings. Everything addressed to its
-system is taken, whatever the component, because a message it cannot forward to another link is its own
-(the routing trap)."""
+"""How the autopilot answers: parameters, commands, stream requests, pings. ArduPilot takes everything addressed to
+its system, whatever the component, because a message it cannot forward to another link is its own (the routing
+trap); PX4 takes its own component's and what is for all."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from magmav_sim.ardupilot import ArduPilot
 from magmav_sim.autopilot import Autopilot
-from magmav_sim.faults import AnyFault, Deaf
-from magmav_sim.messages import BUILDERS, NAMES
+from magmav_sim.faults import AnyFault, Deaf, Slow
+from magmav_sim.param_manners import ArduPilotParams, ParamManners, Px4Params
 from magmav_sim.streams import Streams
 
 WANTED = frozenset(
@@ -21,14 +23,13 @@ WANTED = frozenset(
         "PARAM_REQUEST_READ",
         "PARAM_SET",
         "COMMAND_LONG",
+        "COMMAND_INT",
         "REQUEST_DATA_STREAM",
         "SET_MODE",
         "PING",
     }
 )
-_LIST_PER_FRAME = 3
-_NOT_A_NUMBER_INDEX = 65535
-_FORCE = 21196
+_FORCE, _FORCE_CALIBRATION = 21196, 76
 
 
 class Protocol:
@@ -38,18 +39,27 @@ class Protocol:
     pong : the sequence number of the last PING of ours that somebody answered; -1 before the first.
     """
 
-    def __init__(self, autopilot: Autopilot, streams: Streams, faults: list[AnyFault], fly: Callable[[], bool]) -> None:
+    def __init__(
+        self, autopilot: Autopilot, streams: Streams, faults: Sequence[AnyFault], fly: Callable[[], bool]
+    ) -> None:
         self._a = autopilot
         self._streams = streams
-        self._deaf = [f for f in faults if isinstance(f, Deaf)]
+        self._slow = [f for f in faults if isinstance(f, Slow)]
         self._fly = fly
-        self._list: Iterator[int] = iter(())
+        ardupilot = isinstance(autopilot, ArduPilot)
+        self._params: ParamManners = ArduPilotParams(autopilot) if ardupilot else Px4Params(autopilot)
+        self._late: deque[tuple[int, list[Any]]] = deque()
+        self._numbers = {
+            kind.id: name
+            for name in autopilot.builders
+            if (kind := getattr(dialect, f"MAVLink_{name.lower()}_message"))
+        }
         self.pong = -1
-        self.reboot_wanted = False
 
     def forget(self) -> None:
         """As after a boot."""
-        self._list = iter(())
+        self._params.forget()
+        self._late.clear()
 
     def handle(self, message: Any) -> None:
         """React to one message from the link."""
@@ -58,19 +68,21 @@ class Protocol:
             return
         if getattr(message, "target_system", 0) not in (0, self._a.system):
             return
+        if not self._a.takes(getattr(message, "target_component", 0)):
+            return
         kind = message.get_type()
         if kind == "PING":
             self._ping(message, sender)
-        elif kind == "COMMAND_LONG":
-            self._command(message, sender)
+        elif kind in ("COMMAND_LONG", "COMMAND_INT"):
+            self._answer_later(lambda: self._command(message, sender))
         elif kind == "REQUEST_DATA_STREAM":
             self._streams.request(
                 message.req_stream_id, message.req_message_rate, message.start_stop == 1, self._a.boot_ns
             )
         elif kind == "SET_MODE":
             self._a.mode = message.custom_mode
-        elif kind.startswith("PARAM_") and not any(f.active(self._a.elapsed_ns / 1e9) for f in self._deaf):
-            self._parameter(kind, message)
+        elif kind.startswith("PARAM_") and not self._a.holds(Deaf):
+            self._answer_later(lambda: self._params.handle(message))
 
     def answered(self, message: Any) -> bool:
         """Whether this answers a PING of ours: noted at once, also while booting, because pacing waits for
@@ -82,35 +94,22 @@ class Protocol:
         return True
 
     def trickle(self) -> None:
-        """Send on with a parameter list that was asked for."""
-        for _ in range(_LIST_PER_FRAME):
-            index = next(self._list, None)
-            if index is None:
-                return
-            self._tell(self._a.parameters.names[index], index)
+        """Send on with a parameter list that was asked for, and answers that took their time."""
+        self._answer_later(self._params.trickle)
+        while self._late and self._late[0][0] <= self._a.elapsed_ns:
+            self._a.outbox.extend(self._late.popleft()[1])
 
-    # ------------------------------------------------------------ parameters
-
-    def _parameter(self, kind: str, message: Any) -> None:
-        table = self._a.parameters
-        if kind == "PARAM_REQUEST_LIST":
-            self._list = iter(range(len(table)))
-        elif kind == "PARAM_REQUEST_READ":
-            if message.param_index >= 0:
-                if message.param_index < len(table):
-                    self._tell(table.names[message.param_index], message.param_index)
-            elif message.param_id in table:
-                self._tell(message.param_id, _NOT_A_NUMBER_INDEX)
-        elif kind == "PARAM_SET" and message.param_id in table and math.isfinite(message.param_value):
-            table.put(message.param_id, message.param_value)
-            self._tell(message.param_id, _NOT_A_NUMBER_INDEX)
-            self._a.param_was_set(message.param_id, table[message.param_id])
-
-    def _tell(self, name: str, index: int) -> None:
-        table = self._a.parameters
-        self._a.outbox.append(
-            dialect.MAVLink_param_value_message(name.encode(), table[name], table.kind(name), len(table), index)
-        )
+    def _answer_later(self, act: Callable[[], None]) -> None:
+        """Do it now; while the autopilot is slow what it says about it waits."""
+        before = len(self._a.outbox)
+        act()
+        wait_s = max((f.seconds for f in self._slow if f.active(self._a.elapsed_ns / 1e9)), default=0.0)
+        if wait_s or self._late:  # nothing overtakes
+            said = self._a.outbox[before:]
+            del self._a.outbox[before:]
+            due_ns = self._a.elapsed_ns + round(wait_s * 1e9)
+            if said:
+                self._late.append((max(due_ns, self._late[-1][0] if self._late else 0), said))
 
     # ------------------------------------------------------------ the rest
 
@@ -124,36 +123,42 @@ class Protocol:
         self._a.outbox.append(ack)
 
     def _run(self, command: int, m: Any) -> int:
-        accepted, failed = dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_FAILED
+        accepted, refused = int(dialect.MAV_RESULT_ACCEPTED), int(self._a.refused)
         a = self._a
         if command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-            name = NAMES.get(int(m.param1))
+            name = self._numbers.get(int(m.param1))
             if name is None or not math.isfinite(m.param2):
-                return int(dialect.MAV_RESULT_DENIED)
+                return int(a.unknown_stream)
             self._streams.set_interval(name, m.param2, a.boot_ns)
         elif command == dialect.MAV_CMD_GET_MESSAGE_INTERVAL:
-            name = NAMES.get(int(m.param1))
+            name = self._numbers.get(int(m.param1))
             us = 0 if name is None else self._streams.interval_us(name)
             a.outbox.append(dialect.MAVLink_message_interval_message(int(m.param1), us))
         elif command == dialect.MAV_CMD_REQUEST_MESSAGE:
-            name = NAMES.get(int(m.param1))
-            built = None if name is None else BUILDERS[name](a)
-            if built is None:
-                return int(failed)
-            a.outbox.append(built)
+            name = self._numbers.get(int(m.param1))
+            built = None if name is None else a.builders[name](a)
+            if not built:
+                return int(dialect.MAV_RESULT_FAILED)
+            a.outbox.extend(built if isinstance(built, list) else [built])
         elif command == dialect.MAV_CMD_COMPONENT_ARM_DISARM:
             done = a.arm(force=m.param2 == _FORCE) if m.param1 == 1 else a.disarm()
-            return int(accepted if done else failed)
+            return accepted if done else refused
         elif command == dialect.MAV_CMD_DO_SET_MODE:
-            a.mode = int(m.param2)
+            a.mode = int(m.param2) if isinstance(a, ArduPilot) else int(m.param2) << 16 | int(m.param3) << 24
         elif command == dialect.MAV_CMD_MISSION_START:
-            return int(accepted if self._fly() else failed)
+            return accepted if self._fly() else refused
         elif command == dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and m.param1 == 1:
             if a.armed:
-                return int(failed)
-            self.reboot_wanted = True
+                return refused
+            a.reboot_wanted = True
         elif command == dialect.MAV_CMD_PREFLIGHT_CALIBRATION and a.armed:
-            return int(failed)
+            return refused
+        elif (
+            command == dialect.MAV_CMD_PREFLIGHT_CALIBRATION
+            and m.param2 == _FORCE_CALIBRATION
+            and isinstance(a, ArduPilot)
+        ):
+            a.commit()
         else:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
-        return int(accepted)
+        return accepted

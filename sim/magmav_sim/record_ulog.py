@@ -13,6 +13,8 @@ from typing import BinaryIO
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from magmav_sim.parameters import INT32
+from magmav_sim.px4 import Px4
 from magmav_sim.px4_calibration import px4_parameters
 from magmav_sim.record_moment import Moment
 from magmav_sim.ulog_layout import TOPICS, layout
@@ -78,7 +80,7 @@ class ULogWriter:
     def _parameters(self, m: Moment) -> None:
         """Those that changed since they were last logged; at first all."""
         a = m.autopilot
-        wanted: dict[str, int | float] = {
+        wanted: dict[str, int | float] = native(a) if isinstance(a, Px4) else {
             "MAV_SYS_ID": a.system, "MAV_COMP_ID": a.component, "MAV_TYPE": a.kind,
             "SYS_AUTOSTART": _QUAD if a.quad else _PLANE, "SENS_BOARD_ROT": 0, "SENS_MAG_AUTOCAL": 0,
             "SENS_MAG_MODE": 0, "SDLOG_MODE": 2, **px4_parameters(a.parameters, len(a.raw_mg)),
@@ -150,7 +152,7 @@ class ULogWriter:
         for i, (raw, field) in enumerate(zip(a.raw_mg, a.published_mg, strict=True)):
             if raw is None:
                 continue
-            device = int(self._held[f"CAL_MAG{i}_ID"]) & 0xFFFFFFFF
+            device = a.detected[i] & 0xFFFFFFFF
             self._data("sensor_mag", sampled_us, device, *(v / 1e3 for v in raw), 25.0, 0, instance=i)
             self._data("vehicle_magnetometer", sampled_us, device, *(v / 1e3 for v in field), 1, instance=i)
 
@@ -187,3 +189,9 @@ class ULogWriter:
             "vehicle_gps_position", self._us, m.autopilot.unix_ns // 1000, lat, lon, alt, alt, 0, 0.3, 0.6, 0.9, 0.8,
             1.2, speed, s.vn_mps, s.ve_mps, s.vd_mps, course, 0, 3, True, 14,
         )  # fmt: skip
+
+
+def native(a: Px4) -> dict[str, int | float]:
+    """PX4's own parameters, int where they are int32."""
+    table = a.parameters
+    return {n: int(table[n]) if table.kind(n) == INT32 else table[n] for n in table.names}

@@ -33,6 +33,8 @@ _LISTENED_HZ = {
     "GPS_RAW_INT": 5.0, "BATTERY_STATUS": 10.0, "SYS_STATUS": 2.0, "VFR_HUD": 5.0, "SYSTEM_TIME": 1.0,
     "EXTENDED_SYS_STATE": 2.0,
 }  # fmt: skip
+_LISTENED_PX4_HZ = {"RAW_IMU": "SCALED_IMU"}  # where PX4 has another message
+_ARDUPILOTS = (".bin", ".log")
 
 
 class Writer(Protocol):
@@ -77,8 +79,11 @@ def unattended(scenario: Scenario) -> Scenario:
     """The scenario as flown when only files listen: flights start by themselves, the end is the end, and the
     vehicle streams without being asked what a ground station would have asked for."""
     replace = msgspec.structs.replace
+    listened = _LISTENED_HZ
+    if scenario.autopilot.kind == "px4":
+        listened = {_LISTENED_PX4_HZ.get(name, name): hz for name, hz in listened.items()}
     flights = [replace(flight, start="auto") for flight in scenario.flights]
-    autopilot = replace(scenario.autopilot, rates_hz=_LISTENED_HZ | scenario.autopilot.rates_hz)
+    autopilot = replace(scenario.autopilot, rates_hz=listened | scenario.autopilot.rates_hz)
     return replace(scenario, flights=flights, stay=False, autopilot=autopilot)
 
 
@@ -88,7 +93,7 @@ class Recorder:
     files : what was written, in order. Nothing is overwritten (FileExistsError). An autopilot begins a new log when
     it boots, so after a reboot .bin, .log and .ulg go on in NAME_2, a .tlog goes on as it is.
     fetch : ask for all parameters after each boot, as a ground station does.
-    ValueError for an unknown ending, OSError where a file cannot be made.
+    ValueError for an unknown ending, or one that this autopilot does not keep, OSError where a file cannot be made.
     """
 
     def __init__(self, simulation: Simulation, paths: Iterable[Path], *, fetch: bool = True) -> None:
@@ -107,6 +112,9 @@ class Recorder:
         odd = next((p for p in self._paths if not recordable(p)), None)
         if odd is not None:
             raise ValueError(f"{odd}: want a name that ends in one of {kinds()}")
+        odd = next((p for p in self._paths if p.suffix.lower() in _ARDUPILOTS), None)
+        if odd is not None and simulation.scenario.autopilot.kind == "px4":
+            raise ValueError(f"{odd}: PX4 keeps no such log; want .ulg or .tlog")
         try:
             for path in self._paths:
                 self._begin(path, path)

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from magmav_sim.faults import AnyFault, Vector
+from magmav_sim.faults import AnyFault, SecondRoute, Vector
 from magmav_sim.patterns import AnyPattern
 
 _Share = Annotated[float, msgspec.Meta(ge=0)]
@@ -43,6 +43,7 @@ class CompassSpec(_Table, frozen=True, kw_only=True):
 
     hard_iron_mg and motor_mg_per_a are in body axes; noise_mg is the sigma of each 100 Hz sample.
     orient is the mounting (MAV_SENSOR_ORIENTATION), which COMPASS_ORIENT of an external compass undoes.
+    committed: its device id is stored as that of the calibrated one; else the autopilot calls it not calibrated.
     """
 
     device_id: int
@@ -53,7 +54,8 @@ class CompassSpec(_Table, frozen=True, kw_only=True):
     delay_ms: Annotated[float, msgspec.Meta(ge=0, le=500)] = 0.0
     drift_mg_per_s: Vector = (0, 0, 0)
     external: bool = True
-    orient: Annotated[int, msgspec.Meta(ge=0, le=25)] = 0
+    orient: Annotated[int, msgspec.Meta(ge=0, le=40)] = 0
+    committed: bool = True
 
 
 class Anomaly(_Table, frozen=True, kw_only=True):
@@ -67,10 +69,20 @@ class Anomaly(_Table, frozen=True, kw_only=True):
 class AutopilotSpec(_Table, frozen=True, kw_only=True):
     """How the autopilot behaves. yaw "compass" follows its own corrected compass 1, "truth" does not.
 
+    release : "older" is ArduPilot 4.5, silent about what it does not take, and a PX4 that ignores a change of offsets
+    up to 10 mG and applies changes only disarmed; "newer" answers with PARAM_ERROR, ignores up to 5 mG, applies always.
+    naming : ArduPilot's COMPASS_OFS2_X ("old") or COMPASS2_OFS_X ("new").
+    uid : what AUTOPILOT_VERSION says of the board; from the seed where it is not given.
+    ekf_tau_s : how fast PX4's filter learns what its calibration left over, in the air.
     rates_hz : messages streamed after boot without being asked, name to rate.
-    parameters : stored values that differ from the defaults, ArduPilot's names.
+    parameters : stored values that differ from the defaults, the autopilot's own names.
     """
 
+    kind: Literal["ardupilot", "px4"] = "ardupilot"
+    release: Literal["older", "newer"] = "older"
+    naming: Literal["old", "new"] = "old"
+    uid: Annotated[int, msgspec.Meta(ge=1, le=0xFFFFFFFFFFFF)] | None = None
+    ekf_tau_s: Annotated[float, msgspec.Meta(gt=0)] = 20.0
     yaw: Literal["compass", "truth"] = "compass"
     system: Annotated[int, msgspec.Meta(ge=1, le=250)] = 1
     imus: Annotated[int, msgspec.Meta(ge=1, le=3)] = 2
@@ -120,3 +132,20 @@ class Scenario(_Table, frozen=True, kw_only=True):
         start = datetime.datetime(self.date.year, 1, 1, tzinfo=self.date.tzinfo)
         end = start.replace(year=start.year + 1)
         return self.date.year + (self.date - start) / (end - start)
+
+
+def with_autopilot(scenario: Scenario, kind: Literal["ardupilot", "px4"]) -> Scenario:
+    """The same scenario under the other autopilot. ScenarioError where it stores parameters of its own autopilot."""
+    if kind == scenario.autopilot.kind:
+        return scenario
+    named: list[Any] = [*scenario.autopilot.parameters, *(getattr(f, "name", None) for f in scenario.faults)]
+    odd = next((name for name in named if name is not None), None)
+    if odd is not None:
+        raise ScenarioError(f"scenario {scenario.name}: it names {odd}, which is not for {kind}")
+    replace = msgspec.structs.replace
+    return replace(scenario, autopilot=replace(scenario.autopilot, kind=kind))
+
+
+def has_second_route(scenario: Scenario) -> bool:
+    """Whether somebody speaks over a route of its own."""
+    return any(isinstance(fault, SecondRoute) for fault in scenario.faults)

@@ -61,9 +61,10 @@ def serve(
     speed: float | None = 1.0,
     truth: TruthLog | None = None,
     stop: Callable[[], bool] = lambda: False,
+    second: Link | None = None,
 ) -> None:
     """Fly until the scenario ends, the link does, or ``stop`` says so. The link's quiet ticks are the
-    clock."""
+    clock. ``second``: another link to the same place, for what comes over a second route; it is only sent to."""
     pacer = Pacer(speed)
     for packet in link.packets():
         if packet.data:
@@ -77,6 +78,9 @@ def serve(
                 frames.append(simulation.ping(due))
             for datagram in packed(frames):
                 link.send(datagram)
+            for datagram in packed(simulation.second_route()):
+                if second is not None:
+                    second.send(datagram)
             if truth is not None:
                 truth.sample()
         if simulation.finished or stop():

@@ -1,20 +1,11 @@
-"""Which messages go out when, as ArduPilot schedules them on one link."""
+"""Which messages go out when, as the autopilot schedules them on one link."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from magmav_sim.messages import BUILDERS
+from magmav_sim.autopilot import Autopilot
 
-_GROUPS: dict[int, tuple[str, ...]] = {
-    1: ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"),
-    2: ("SYS_STATUS", "GPS_RAW_INT"),
-    3: (),
-    6: ("GLOBAL_POSITION_INT",),
-    10: ("ATTITUDE",),
-    11: ("VFR_HUD",),
-    12: ("BATTERY_STATUS", "SYSTEM_TIME"),
-}
 _SHORTEST_US, _LONGEST_US = 1000, 60_000_000
 _FASTEST_NS = 10_000_000  # one frame of the simulation; ArduPilot's own cap is 80 % of its loop rate
 _MS = 1_000_000
@@ -23,11 +14,12 @@ _MS = 1_000_000
 class Streams:
     """Intervals per message, ns; HEARTBEAT always at 1 Hz after boot. Times are boot times."""
 
-    def __init__(self, defaults_hz: Mapping[str, float]) -> None:
+    def __init__(self, autopilot: Autopilot, rates_hz: Mapping[str, float]) -> None:
+        self._groups = autopilot.groups
         self._defaults = {"HEARTBEAT": 1_000_000_000}
-        for name, rate in defaults_hz.items():
-            if name not in BUILDERS:
-                raise ValueError(f"rates_hz: no message {name!r}; there are {', '.join(BUILDERS)}")
+        for name, rate in {**autopilot.streams_hz, **rates_hz}.items():
+            if name not in autopilot.builders:
+                raise ValueError(f"rates_hz: no message {name!r}; there are {', '.join(autopilot.builders)}")
             self._defaults[name] = max(_FASTEST_NS, round(1e9 / rate))
         self.reset()
 
@@ -56,7 +48,7 @@ class Streams:
 
     def request(self, group: int, rate_hz: int, start: bool, now_ns: int) -> None:
         """REQUEST_DATA_STREAM; group 0 is all of them, unknown groups are ignored."""
-        for number, names in _GROUPS.items():
+        for number, names in self._groups.items():
             if group in (0, number):
                 for name in names:
                     self.set_interval(name, 1e6 / rate_hz if start and rate_hz > 0 else -1, now_ns)

@@ -11,6 +11,7 @@ from pygeomag import GeoMag
 
 from magmav_sim.airframe import FRAME_S, State
 from magmav_sim.faults import Absent, Frozen, Vector, iron_at
+from magmav_sim.mounting import rotation_matrix
 from magmav_sim.scenario import CompassSpec, Scenario
 
 _MG_PER_NT = 0.01
@@ -76,7 +77,7 @@ class Sensor:
         self._faults = [f for f in scenario.faults if getattr(f, "compass", 0) == number]
         self._stuck = [f for f in self._faults if isinstance(f, Frozen)]
         self._gone = [f for f in self._faults if isinstance(f, Absent)]
-        self._to_sensor = np.asarray(rotation_matrix(spec.orient)).T
+        self._to_sensor = np.asarray(rotation_matrix(spec.orient, scenario.autopilot.kind)).T
         self._plain = spec.orient == 0
         self._rng = rng
         self._noise: list[list[float]] = []
@@ -127,27 +128,3 @@ class Sensor:
             value = (x, y, z)
         self._last = value
         return value
-
-
-_ROTATIONS_DEG = {
-    **{k: (0, 0, 45 * k) for k in range(8)},
-    **{8 + k: (180, 0, 45 * k) for k in range(8) if k != 4},
-    12: (0, 180, 0),
-    **{16 + k: (90, 0, 45 * k) for k in range(4)},
-    **{20 + k: (270, 0, 45 * k) for k in range(4)},
-    24: (0, 90, 0),
-    25: (0, 270, 0),
-}
-
-
-def rotation_matrix(orient: int) -> tuple[Vector, Vector, Vector]:
-    """Sensor axes to body axes for a MAV_SENSOR_ORIENTATION number 0 to 25. ValueError for others."""
-    if orient not in _ROTATIONS_DEG:
-        raise ValueError(f"orient: mountings 0 to 25 are simulated, got {orient}")
-    roll, pitch, yaw = (math.radians(a) for a in _ROTATIONS_DEG[orient])
-    sr, cr, sp, cp, sy, cy = (f(a) for a in (roll, pitch, yaw) for f in (math.sin, math.cos))
-    return (
-        (cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy),
-        (cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy),
-        (-sp, sr * cp, cr * cp),
-    )
