@@ -223,7 +223,8 @@ def test_every_mounting_is_undone_by_its_number(orient):
 
 def test_the_order_of_correction_by_hand():
     """body = R S (sensor + COMP power - OFF): any other order gives other numbers."""
-    words = "CAL_MAG0_XOFF = 0.1\nCAL_MAG0_XSCALE = 2.0\nCAL_MAG0_XODIAG = 0.5\nCAL_MAG0_XCOMP = 10.0\nCAL_MAG_COMP_TYP = 2\n"
+    stored = {"XOFF": 0.1, "XSCALE": 2.0, "XODIAG": 0.5, "XCOMP": 10.0}
+    words = "CAL_MAG_COMP_TYP = 2\n" + "".join(f"CAL_MAG0_{k} = {v}\n" for k, v in stored.items())
     sim = vehicle(words, compass=COMPASS + "orient = 2\n")  # sensor x is body y
     sim.advance(0.1)
     x, y, z = (earth_b_mg(sim) + IRON)[[1, 0, 2]] * (1, -1, 1)
@@ -247,7 +248,7 @@ def test_highest_priority_is_what_the_filter_follows():
     np.testing.assert_allclose(ground.gauss() * 1000, earth_b_mg(ground.sim) + IRON, atol=1e-3)
     ground.put("CAL_MAG0_PRIO", 25, INT32)
     ground.run(1.2)
-    np.testing.assert_allclose(ground.gauss() * 1000, earth_b_mg(ground.sim) + (0, 30, 0), atol=1e-3)
+    np.testing.assert_allclose(ground.gauss() * 1000, earth_b_mg(ground.sim) + np.array((0, 30, 0)), atol=1e-3)
 
 
 # ---------------------------------------------------------------- calibration
