@@ -7,7 +7,11 @@ from pathlib import Path
 import msgspec
 
 from magmav.core.types import AxisState, Change, ParamReading, State, vec3
-from magmav.mavlink.autopilot.ardupilot import Calibrations, plan_change
+from magmav.mavlink.autopilot.ardupilot import Calibrations
+from magmav.mavlink.autopilot.plan import plan_change
+from magmav.mavlink.autopilot.px4 import Px4Calibrations
+from magmav.mavlink.autopilot.px4_slots import IDS
+from magmav.mavlink.autopilot.stored import StoredCalibrations
 
 _Three = tuple[float, float, float]
 
@@ -58,12 +62,21 @@ def change_from_result(path: Path, compass: int) -> Change:
     if entry.state != State.READY.name or entry.hard_iron_mg is None or entry.sigma_mg is None:
         why = "; ".join(r.text for r in entry.reasons) or entry.state
         raise NotReady(f"{path}: compass {compass} is not ready to be written: {why}")
-    held = Calibrations()
-    for name, value in entry.stored.items():
-        held.param(ParamReading(vehicle.system, 1, name, value, 65535, 0))
+    held = _held(vehicle.system, compass, entry.stored)
     x, y, z = (axis is not AxisState.NOT_OBSERVED for axis in entry.axes)
     iron, sigma = vec3(entry.hard_iron_mg, "hard_iron_mg"), vec3(entry.sigma_mg, "sigma_mg")
     change = plan_change(held, vehicle.system, compass, iron, sigma, (x, y, z))
     if change is None:
         raise NotReady(f"{path}: stored offsets or device id of compass {compass} are not in it")
     return change
+
+
+def _held(system: int, compass: int, stored: dict[str, float]) -> StoredCalibrations:
+    """What the vehicle stored, by the rules of the autopilot whose names these are."""
+    devices = [int(stored[name]) for name in IDS if name in stored]
+    held: StoredCalibrations = Px4Calibrations() if devices else Calibrations()
+    for name, value in stored.items():
+        held.param(ParamReading(system, 1, name, value, 65535, 0))
+    if len(devices) == 1:
+        held.sensor(compass, devices[0], "sensor_mag")
+    return held

@@ -40,6 +40,7 @@ _ONLY_PX4 = ("CAL_", "SENS_")  # names that tell whose they are before a heartbe
 _EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
 # No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
 _MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
+_MOST_GAUSS = 10.0  # a length beyond it, twenty times the Earth's field, is in another unit
 _COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
 
 
@@ -140,7 +141,10 @@ class Decoder:
         if m.fields_updated & 0b111000000 != 0b111000000 or not gauss.any():
             return out
         # Some ArduPilot builds send mG times 1000 and call it gauss: a million times too much (autopilots.md 1.2).
-        scale = 1e3 if math.hypot(*gauss) <= 10.0 else 1e-3
+        length = math.hypot(*gauss)
+        scale = 1e3 if length <= _MOST_GAUSS else 1.0 if length <= _MOST_GAUSS * 1e3 else 1e-3
+        if scale < 1e3:
+            self.counts[f"HIGHRES_IMU: field {1e3 / scale:.0f} times too large, put right"] += 1
         x, y, z = (gauss * scale).tolist()
         out.append(MagReading(system, m.id + 1, "HIGHRES_IMU", boot_ns, _within(_MOST_MG, (x, y, z), "field")))
         return out

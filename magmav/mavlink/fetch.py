@@ -68,6 +68,11 @@ class ParamFetch:
         for name in names:
             self._state[name] = _Name()
 
+    def want(self, names: Sequence[str]) -> None:
+        """These names from now on; what was heard of them stays heard."""
+        if tuple(self._state) != tuple(names):
+            self._state = {name: self._state.get(name) or _Name() for name in names}
+
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
         """Tick off what the autopilot says, asked for or not."""
         autopilot = self._presence.autopilot

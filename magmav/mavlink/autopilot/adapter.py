@@ -33,6 +33,16 @@ class Adapter(Protocol):
         """What one unit of an offset parameter is in mG; its sign is not in it."""
         ...
 
+    @property
+    def compass_streams(self) -> tuple[str, ...]:
+        """Messages that carry the compasses we learn from, and gyro and accelerometer with them."""
+        ...
+
+    @property
+    def slow_streams(self) -> tuple[str, ...]:
+        """Messages that are wanted now and then besides those every autopilot sends."""
+        ...
+
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
         """Parameters to fetch for compasses (1, 2 or 3). ValueError for another number.
 

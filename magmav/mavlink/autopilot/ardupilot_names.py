@@ -58,6 +58,10 @@ class Scheme:
 CLASSIC, NUMBERED = Scheme(False), Scheme(True)
 
 
+FEELER = NUMBERED.offsets(1)[0]
+"""Asked for where it is not known which scheme a vehicle speaks."""
+
+
 def scheme_of(names: Collection[str]) -> Scheme:
     """The scheme of a vehicle that has these parameters. Classic where nothing says otherwise."""
     numbered = any(n in names for c in COMPASSES for n in NUMBERED.offsets(c))
@@ -76,18 +80,18 @@ class ArduPilot:
     kind = int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
     least_step_mg = 0.0
     unit_mg = 1.0
+    compass_streams: tuple[str, ...] = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3")
+    slow_streams: tuple[str, ...] = ()
 
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
         """The classic names and one of the others as a feeler; all of the others once a vehicle answers for one."""
         scheme, wanted = scheme_of(answered), tuple(compasses)
-        names: list[str] = []
+        settled = any(name in answered for c in COMPASSES for each in (CLASSIC, NUMBERED) for name in each.offsets(c))
+        names = [] if settled else [FEELER]
+        names += [priority_name(compass) for compass in wanted]  # what a vehicle may not have first: silence takes long
         for compass in wanted:
             names += [*scheme.offsets(compass), scheme.device(compass), *scheme.shaping(compass)]
-        names += [priority_name(compass) for compass in wanted]
-        feeler = (
-            [NUMBERED.offsets(1)[0]] if not any(n in answered for c in COMPASSES for n in CLASSIC.offsets(c)) else []
-        )
-        return tuple(dict.fromkeys(names + feeler))
+        return tuple(dict.fromkeys(names))
 
     def offset_names(self, compass: int) -> tuple[str, str, str]:
         """COMPASS_OFS_X and its kin for this compass."""

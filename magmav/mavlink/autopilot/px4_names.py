@@ -49,6 +49,8 @@ class Px4:
     kind = int(dialect.MAV_AUTOPILOT_PX4)
     least_step_mg = 10.0
     unit_mg = MG_PER_GAUSS
+    compass_streams: tuple[str, ...] = ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")  # there is no RAW_IMU
+    slow_streams: tuple[str, ...] = ("MAG_CAL_REPORT",)  # which slot a compass uses; sent when parameters change
 
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
         """All slots, whichever compasses are asked for: a compass may be in any."""

@@ -128,6 +128,10 @@ class StoredCalibrations(Protocol):
         """Every value heard for this compass, in the autopilot's own names and units."""
         ...
 
+    def value(self, name: str) -> float | None:
+        """One value as heard."""
+        ...
+
     def shaping(self, compass: int) -> Shaping:
         """What the autopilot does after its offsets."""
         ...
