@@ -39,6 +39,16 @@ def test_offsets_alone_do_not_commit_a_device_id():
     assert ground.command(241, 0, 76) == FAILED  # disarmed only
 
 
+def test_asked_for_its_checks_it_says_what_they_find_and_changes_nothing():
+    ground = Ground(simulation(COMPASS + "committed = false\n" + CHECKS))
+    ground.set("COMPASS_OFS_X", -100.0)
+    assert ground.command(401) == ACCEPTED and said(ground) == [NOT_CALIBRATED]
+    ground.command(241, 0, 76)
+    ground.heard.clear()
+    assert ground.command(401) == ACCEPTED and said(ground) == []
+    assert not ground.sim.truth.armed
+
+
 def test_all_zero_offsets_are_not_calibrated_whatever_is_committed():
     ground = Ground(simulation(COMPASS + CHECKS))
     assert ground.command(241, 0, 76) == ACCEPTED
@@ -173,6 +183,9 @@ def test_board_is_told_in_uid2_as_ardupilot_does():
 
     told = version("[autopilot]\nuid = 4660\n")
     assert told.uid == 0 and bytes(told.uid2)[:3] == b"\x34\x12\x00"
+    ground = Ground(simulation())
+    assert ground.command(520, 1) == ACCEPTED  # the old way to ask
+    assert [m for m in ground.heard if m.get_type() == "AUTOPILOT_VERSION"]
     assert bytes(version("").uid2) == bytes(version("").uid2) != bytes(told.uid2)
 
 

@@ -261,21 +261,14 @@ def test_a_slot_is_found_by_device_id_and_not_by_number():
     np.testing.assert_allclose(sim.autopilot.published_mg[0], earth_b_mg(sim) + IRON - (100, 0, 0), atol=1e-4)
 
 
-def test_internal_compass_turns_with_the_board_and_levelling_is_the_newer_ones_habit():
-    def body(words, release, external="false", orient=4):
-        compass = COMPASS + f"external = {external}\norient = {orient}\n"
-        sim = vehicle(words, compass=compass, release=release)
-        sim.advance(0.1)
-        return np.array(sim.autopilot.published_mg[0]), earth_b_mg(sim) + IRON
-
-    got, want = body("SENS_BOARD_ROT = 4\n", "older")
-    np.testing.assert_allclose(got, want, atol=1e-9)
+@pytest.mark.parametrize(("external", "rot"), [("false", "SENS_BOARD_ROT = 4\n"), ("true", "")])
+def test_internal_compass_turns_with_the_board_and_both_are_levelled(external, rot):
+    compass = COMPASS + f"external = {external}\norient = 4\n"
     level = body_from_ned(math.radians(3.0), 0.0, 0.0).T
-    for release, external, turned in (
-        ("older", "false", True), ("newer", "false", True), ("older", "true", False), ("newer", "true", True),
-    ):  # fmt: skip
-        got, want = body("SENS_BOARD_ROT = 4\nSENS_BOARD_X_OFF = 3.0\n", release, external)
-        np.testing.assert_allclose(got, level @ want if turned else want, atol=1e-9)
+    for words, turn in (("", np.eye(3)), ("SENS_BOARD_X_OFF = 3.0\n", level)):
+        sim = vehicle(rot + words, compass=compass)
+        sim.advance(0.1)
+        np.testing.assert_allclose(sim.autopilot.published_mg[0], turn @ (earth_b_mg(sim) + IRON), atol=1e-9)
 
 
 @pytest.mark.parametrize(("release", "ignored_mg"), [("older", 10.0), ("newer", 5.0)])

@@ -140,6 +140,15 @@ class Protocol:
             if not built:
                 return int(dialect.MAV_RESULT_FAILED)
             a.outbox.extend(built if isinstance(built, list) else [built])
+        elif command == dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
+            if m.param1 == 1:
+                a.outbox.append(a.builders["AUTOPILOT_VERSION"](a))
+        elif command == dialect.MAV_CMD_RUN_PREARM_CHECKS and isinstance(a, ArduPilot):
+            if a.armed:
+                return int(dialect.MAV_RESULT_TEMPORARILY_REJECTED)
+            why = a.compass_refusal()
+            if why is not None:
+                a.say(dialect.MAV_SEVERITY_CRITICAL, why)
         elif command == dialect.MAV_CMD_COMPONENT_ARM_DISARM:
             done = a.arm(force=m.param2 == _FORCE) if m.param1 == 1 else a.disarm()
             return accepted if done else refused

@@ -99,7 +99,7 @@ class Px4(Autopilot):
             return
         self._dirty, self._unreported, self._updated_ns = False, True, self.elapsed_ns
         new = [
-            stored(self.parameters, device, external=external, newer=self.newer)
+            stored(self.parameters, device, external=external)
             for device, external in zip(self.detected, self._external, strict=True)
         ]
         if self.applied and not boot:

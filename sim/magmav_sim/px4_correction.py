@@ -58,11 +58,11 @@ def triple(table: Parameters, slot: int, stem: str) -> np.ndarray:
     return np.array([table[f"CAL_MAG{slot}_{axis}{stem}"] for axis in "XYZ"])
 
 
-def stored(table: Parameters, device_id: int, *, external: bool, newer: bool) -> Px4Correction:
+def stored(table: Parameters, device_id: int, *, external: bool) -> Px4Correction:
     """What the parameters say for a sensor."""
     slot = slot_of(table, device_id)
     by = int(table["CAL_MAG_COMP_TYP"])
-    rotation = _rotation(table, slot, external=external, newer=newer)
+    rotation = _rotation(table, slot, external=external)
     if slot is None:
         return Px4Correction(rotation, np.eye(3), np.zeros(3), np.zeros(3), by)
     scale = np.diag(triple(table, slot, "SCALE"))
@@ -71,8 +71,8 @@ def stored(table: Parameters, device_id: int, *, external: bool, newer: bool) ->
     return Px4Correction(rotation, scale, triple(table, slot, "OFF"), triple(table, slot, "COMP"), by)
 
 
-def _rotation(table: Parameters, slot: int | None, *, external: bool, newer: bool) -> np.ndarray:
-    """CAL_MAGn_ROT, or the board's for an internal compass; levelled, but by old releases internal ones only."""
+def _rotation(table: Parameters, slot: int | None, *, external: bool) -> np.ndarray:
+    """CAL_MAGn_ROT, or the board's for an internal compass; the level adjustment on top of either."""
     number = _BOARD if slot is None else int(table[f"CAL_MAG{slot}_ROT"])
     if slot is None and external:
         number = 0
@@ -83,7 +83,7 @@ def _rotation(table: Parameters, slot: int | None, *, external: bool, newer: boo
         own = np.array(turned(*(table[f"CAL_MAG{slot}_{angle}"] for angle in ("ROLL", "PITCH", "YAW"))))
     else:
         own = _matrix(number)
-    return np.asarray(level @ own) if newer else own
+    return np.asarray(level @ own)
 
 
 def _matrix(number: int) -> np.ndarray:
