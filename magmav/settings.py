@@ -7,6 +7,7 @@ a value out of range are refused by name.
 from __future__ import annotations
 
 import math
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +23,17 @@ class SettingsError(ValueError):
     """A settings file or value that cannot be used; the text names file, key and limits."""
 
 
-def _knob(text: str, unit: str = "", param: str = "", ge: float | None = None, le: float | None = None) -> Meta:
-    return Meta(description=text, ge=ge, le=le, extra={"unit": unit, "param": param})
+def _knob(
+    text: str,
+    unit: str = "",
+    param: str = "",
+    ge: float | None = None,
+    le: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Meta:
+    """``param``: its name on the wire. Without one it is fixed from the start: who we are, where we are, what kind of
+    sensor and estimator, and what only makes sense on the bench."""
+    return Meta(description=text, ge=ge, le=le, extra={"unit": unit, "param": param, "choices": choices})
 
 
 class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -58,8 +68,15 @@ class Attitude(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Heading(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the published heading is made of the measured ones."""
 
-    smooth: Annotated[str, _knob("one of " + ", ".join(SMOOTHINGS) + "; fixed_lag is smoothest and late")] = "off"
-    lag: Annotated[int, _knob("how late fixed_lag publishes", "samples", ge=1, le=200)] = 10
+    smooth: Annotated[
+        str,
+        _knob(
+            "one of " + ", ".join(SMOOTHINGS) + "; fixed_lag is smoothest and late",
+            param="MMAG_SMOOTH",
+            choices=tuple(SMOOTHINGS),
+        ),
+    ] = "off"
+    lag: Annotated[int, _knob("how late fixed_lag publishes", "samples", "MMAG_LAG", 1, 200)] = 10
 
 
 class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -68,9 +85,9 @@ class Learn(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     on: Annotated[bool, _knob("learn at all; off: what is known is kept and published", param="MMAG_LEARN")] = True
     estimator: Annotated[str, _knob("one of " + ", ".join(ESTIMATORS), ge=None)] = "adaptive"
     on_ground: Annotated[bool, _knob("--bench: what flies learns, and may be ready, on the ground too")] = False
-    settle_s: Annotated[float, _knob("not learnt from after a change of compass parameters", "s", ge=0.2, le=10.0)] = (
-        1.0
-    )
+    settle_s: Annotated[
+        float, _knob("not learnt from after a change of compass parameters", "s", "MMAG_SETTLE", 0.2, 10.0)
+    ] = 1.0
 
 
 class Gate(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -87,20 +104,24 @@ class Gate(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         float,
         _knob("largest misfit of field strength, as a share of the model's", "", "MMAG_GATE_FLD", 0.02, 0.3),
     ] = 0.15
-    steady_s: Annotated[float, _knob("the estimate must have stood still this long", "s", ge=2.0, le=60.0)] = 10.0
-    change_s: Annotated[float, _knob("wait this long after a sudden change", "s", ge=2.0, le=120.0)] = 15.0
-    samples: Annotated[int, _knob("least number of distinct readings", ge=20, le=10000)] = 100
+    steady_s: Annotated[
+        float, _knob("the estimate must have stood still this long", "s", "MMAG_GATE_STDY", 2.0, 60.0)
+    ] = 10.0
+    change_s: Annotated[float, _knob("wait this long after a sudden change", "s", "MMAG_GATE_CHG", 2.0, 120.0)] = 15.0
+    samples: Annotated[int, _knob("least number of distinct readings", "", "MMAG_GATE_N", 20, 10000)] = 100
 
 
 class Wire(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is sent, and how much of it."""
 
     heading_hz: Annotated[float, _knob("NAMED_VALUE_FLOAT heading", "Hz", "MMAG_HDG_RATE", 0.0, 20.0)] = 2.0
-    budget_bps: Annotated[float, _knob("own downlink at most", "B/s", ge=100.0, le=100000.0)] = 500.0
-    imu_hz: Annotated[float, _knob("RAW_IMU, SCALED_IMU2, SCALED_IMU3 asked for", "Hz", ge=0.0, le=100.0)] = 20.0
-    attitude_hz: Annotated[float, _knob("ATTITUDE asked for", "Hz", ge=0.0, le=100.0)] = 20.0
+    budget_bps: Annotated[float, _knob("own downlink at most", "B/s", "MMAG_BUDGET", 100.0, 100000.0)] = 500.0
+    imu_hz: Annotated[float, _knob("RAW_IMU, SCALED_IMU2, SCALED_IMU3 asked for", "Hz", "MMAG_IMU_HZ", 0.0, 100.0)] = (
+        20.0
+    )
+    attitude_hz: Annotated[float, _knob("ATTITUDE asked for", "Hz", "MMAG_ATT_HZ", 0.0, 100.0)] = 20.0
     slow_hz: Annotated[
-        float, _knob("position, battery, throttle, time, landed state asked for", "Hz", ge=0.0, le=10.0)
+        float, _knob("position, battery, throttle, time, landed state asked for", "Hz", "MMAG_SLOW_HZ", 0.0, 10.0)
     ] = 2.0
 
 
@@ -108,14 +129,16 @@ class Upload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Limits of a write. Nothing is ever written unasked."""
 
     confirm_above_mg: Annotated[
-        float, _knob("a larger change of an axis wants the confirmation code", "mG", ge=10.0, le=150.0)
+        float, _knob("a larger change of an axis wants the confirmation code", "mG", "MMAG_CONF_ABOVE", 10.0, 150.0)
     ] = 150.0
 
 
 class Coach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The next motion that would teach most, and what is wrong with a compass, in words."""
 
-    say: Annotated[bool, _knob("say it by STATUSTEXT too, at most every 30 s; `magmav run` always shows it")] = False
+    say: Annotated[
+        bool, _knob("say it by STATUSTEXT too, at most every 30 s; `magmav run` always shows it", param="MMAG_COACH")
+    ] = False
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -145,8 +168,10 @@ class Knob(Struct, frozen=True):
     low: float | None
     high: float | None
     text: str
+    choices: tuple[str, ...] = ()  # of a text; on the wire its place in this list
 
 
+@cache
 def knobs() -> tuple[Knob, ...]:
     """The whole table, in order."""
     rows = []
@@ -166,6 +191,7 @@ def knobs() -> tuple[Knob, ...]:
                     meta.ge,
                     meta.le,
                     meta.description,
+                    meta.extra["choices"],
                 )
             )
     return tuple(rows)

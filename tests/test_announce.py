@@ -12,7 +12,8 @@ from scripted_vehicle import MS, S, Wire, f32
 
 from magmav.mavlink.announce import Announcer
 from magmav.mavlink.budget import Budget
-from magmav.mavlink.params import Entry, ParamServer
+from magmav.mavlink.entry import Entry
+from magmav.mavlink.params import ParamServer
 from magmav.mavlink.presence import Presence
 
 NAN = float("nan")

@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scripted_vehicle import MS, S, Wire, f32
 
 from magmav.mavlink.budget import Budget
-from magmav.mavlink.params import Entry, ParamServer
+from magmav.mavlink.entry import Entry
+from magmav.mavlink.params import ParamServer
 from magmav.mavlink.presence import Presence
 
 WIRE = Wire()

@@ -183,12 +183,15 @@ def test_file_requests_are_refused_the_way_mavlink_ftp_does() -> None:
         message = dialect.MAVLink_file_transfer_protocol_message(0, *target, list(payload.ljust(251, b"\0")))
         return WIRE.carry(message, 255, 190)
 
-    (reply,) = presence.on_message(ftp(asked, 7, 191), "gcs", 4 * S)
+    assert presence.on_message(ftp(asked, 7, 191), "gcs", 4 * S) == [], "it waits for room in the budget"
+    (reply,) = hear(presence, 1.0, from_s=4.0)[1:]  # after the heartbeat
+    assert reply.route == "gcs"
     nak = bytes(WIRE.carry(reply.message, 7, 191).payload)
     assert nak[:6] == bytes((0, 0, 5, 129, 1, 4)) and nak[12] == 10  # seq wraps; NAK of opcode 4: no such file
-    assert presence.on_message(ftp(asked, 7, 1), "gcs", 4 * S) == []
     answer = asked[:3] + bytes((128,)) + asked[4:]
-    assert presence.on_message(ftp(answer, 7, 191), "gcs", 4 * S) == [], "an answer is not answered"
+    for silent in (ftp(asked, 7, 1), ftp(answer, 7, 191)):
+        presence.on_message(silent, "gcs", 5 * S)
+    assert {o.message.get_type() for o in hear(presence, 2.0, from_s=5.0)} == {"HEARTBEAT"}, "no answer is answered"
 
 
 KINDS = sorted(dialect.mavlink_map.values(), key=lambda kind: kind.id)

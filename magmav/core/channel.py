@@ -88,7 +88,7 @@ class Channel:
     ) -> None:
         self._make = make
         self.limits = limits
-        self._steady_s = steady_s
+        self.steady_s = steady_s
         self.held = False
         self.restart()
 
@@ -199,11 +199,11 @@ class Channel:
         self._level_mg += weight * (level_mg - self._level_mg)
         if not self._past or s.boot_ns - self._past[-1][0] >= 1_000_000_000:
             self._past.append((s.boot_ns, e.hard_iron_b_mg))
-        while len(self._past) > 1 and s.boot_ns - self._past[1][0] >= self._steady_s * 1e9:
+        while len(self._past) > 1 and s.boot_ns - self._past[1][0] >= self.steady_s * 1e9:
             self._past.popleft()
 
     def _steady(self, boot_ns: int, e: Estimate, sigma_mg: Vec3) -> bool:
-        if not self._past or boot_ns - self._past[0][0] < self._steady_s * 1e9 * 0.9:
+        if not self._past or boot_ns - self._past[0][0] < self.steady_s * 1e9 * 0.9:
             return False
         moved = np.abs(e.hard_iron_b_mg - self._past[0][1])
         states = gate.axis_states(e.own_sigma_mg, sigma_mg, self.limits.axis_sigma_mg)

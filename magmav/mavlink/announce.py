@@ -49,6 +49,7 @@ class Announcer:
         """How often each heading is sent; 0 for not at all."""
         if not 0 <= heading_hz <= 50:
             raise ValueError(f"heading_hz: want 0 (off) to 50 Hz, got {heading_hz!r}")
+        self._share.rate(max(self._budget.bps / 2, 100.0))  # the budget may have another rate by now
         self._period_ns = round(_SECOND / heading_hz) if heading_hz else 0
 
     def heading(self, compass: int, degrees: float, boot_ns: int, now_ns: int) -> None:

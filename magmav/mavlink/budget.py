@@ -20,15 +20,30 @@ class Budget:
     """
 
     def __init__(self, bps: float = 500.0, *, signed: bool = False) -> None:
-        if not bps >= 100:
-            raise ValueError(f"bps: want at least 100 bytes per second, got {bps!r}")
-        self.bps = bps
         self._extra = _SIGNATURE if signed else 0
-        self._most = max(bps / 2, 100.0)
-        self._per_ns = (bps - self._most / _HOLD_S) / 1e9
         self._tokens = 0.0
         self._then_ns: int | None = None
         self._mav = dialect.MAVLink(None)
+        self.rate(bps)
+
+    def rate(self, bps: float) -> None:
+        """Another rate from now on; a debt stays."""
+        if not bps >= 100:
+            raise ValueError(f"bps: want at least 100 bytes per second, got {bps!r}")
+        self.bps = bps
+        self._most = max(bps / 2, 100.0)
+        self._per_ns = (bps - self._most / _HOLD_S) / 1e9
+        self._tokens = min(self._tokens, self._most)
+
+    @property
+    def reserve(self) -> float:
+        """Bytes that what can wait (a list, a file) leaves for headings and texts. A message always fits beside."""
+        return min(100.0, 0.4 * self._most)
+
+    @property
+    def largest(self) -> int:
+        """The longest frame, without signature, that ``take`` ever lets through beside the reserve."""
+        return int(self._most - self.reserve) - self._extra
 
     def take(self, message: Message, now_ns: int, reserve: float = 0.0) -> bool:
         """May this be sent now? Counts it if so. ``reserve``: bytes to leave for what matters more."""

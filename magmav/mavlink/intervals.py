@@ -43,12 +43,7 @@ class Intervals:
     """wanted : message name -> Hz. ``rates`` tells what really comes, over the last five seconds."""
 
     def __init__(self, wanted: Mapping[str, float], presence: Presence) -> None:
-        for name, hz in wanted.items():
-            if name not in _IDS:
-                raise ValueError(f"wanted: no message is called {name!r}")
-            if not (math.isfinite(hz) and hz > 0):
-                raise ValueError(f"wanted: {name} wants a rate above 0 Hz, got {hz!r}")
-        self._wanted = dict(wanted)
+        self._wanted = _checked(wanted)
         self._presence = presence
         self._key: tuple[int, int, str, int] | None = None
         self.restart()
@@ -61,10 +56,26 @@ class Intervals:
         self._sent_ns = 0
         self._window_ns: int | None = None
 
+    def want(self, wanted: Mapping[str, float]) -> None:
+        """Other rates from now on: what changed is asked for again, what is wanted no more is given back."""
+        self._wanted = _checked(wanted)
+        for name in {**self._streams, **self._wanted}:
+            stream = self._streams.setdefault(name, _Stream(0, 0.0))
+            hz = self._wanted.get(name, 0.0)
+            if hz == stream.hz:
+                continue
+            stream.hz, stream.interval_us = hz, round(1e6 / hz) if hz else 0
+            stream.tries = stream.next_ns = 0
+            stream.pause_ns = FIRST_PAUSE_NS
+            if name in self._queue:
+                self._queue.remove(name)
+            if (hz or stream.changed) and not stream.refused:
+                self._queue.append(name)
+
     @property
     def rates(self) -> dict[str, float]:
         """Hz per wanted message over the last whole window, NaN before there was one."""
-        return {name: stream.rate_hz for name, stream in self._streams.items()}
+        return {name: stream.rate_hz for name, stream in self._streams.items() if stream.hz}
 
     @property
     def refused(self) -> frozenset[str]:
@@ -118,7 +129,7 @@ class Intervals:
     def _request(self, autopilot: Autopilot, name: str, now_ns: int) -> Outgoing:
         stream = self._streams[name]
         stream.tries += 1
-        stream.changed = True
+        stream.changed = stream.hz > 0.0
         stream.next_ns = max(stream.next_ns, now_ns + FIRST_PAUSE_NS)
         self._waiting, self._sent_ns = name, now_ns
         return _command(autopilot, name, stream.interval_us)
@@ -133,7 +144,7 @@ class Intervals:
         for name, stream in self._streams.items():
             stream.rate_hz = stream.count * _SECOND / span_ns
             stream.count = 0
-            if stream.rate_hz >= stream.hz / 2:
+            if stream.rate_hz >= stream.hz / 2:  # also what is wanted no more
                 stream.pause_ns = FIRST_PAUSE_NS
                 continue
             asking = name == self._waiting or name in self._queue
@@ -149,6 +160,15 @@ class Intervals:
         ours = ack.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
         to_us = ack.target_system in (0, self._presence.system)
         return ours and to_us and ack.target_component in (0, self._presence.component)
+
+
+def _checked(wanted: Mapping[str, float]) -> dict[str, float]:
+    for name, hz in wanted.items():
+        if name not in _IDS:
+            raise ValueError(f"wanted: no message is called {name!r}")
+        if not (math.isfinite(hz) and hz > 0):
+            raise ValueError(f"wanted: {name} wants a rate above 0 Hz, got {hz!r}")
+    return dict(wanted)
 
 
 def _command(autopilot: Autopilot, name: str, interval_us: int) -> Outgoing:

@@ -8,20 +8,21 @@ itself, so a name it also has must never be used. Names, order and count never c
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.mavlink.budget import Budget
 from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.entry import Entry
 from magmav.mavlink.float32 import float32
 from magmav.mavlink.presence import Presence
 
 _SECOND = 1_000_000_000
 TRIGGER_QUIET_NS = 30 * _SECOND
 GROUND_GONE_NS = 60 * _SECOND
-_HEADING_RESERVE = 100  # bytes a list leaves in the budget, so that headings go on meanwhile
+_MOST_ROUTES = 16
 _MOST_DEBT_S = 2.0  # a SET is echoed at once unless somebody floods us
 _MISSING = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 _RANGE = dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
@@ -29,24 +30,20 @@ _DENIED = dialect.MAV_PARAM_ERROR_PERMISSION_DENIED
 _READ_ONLY = dialect.MAV_PARAM_ERROR_READ_ONLY
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One parameter. ``set(value, now_ns)`` says whether it took the value; None means read-only.
+class ParamServer:
+    """Answers for (our system, our component or 0); silent about everybody else's names (S13).
 
-    trigger : writing starts something. Only a SET to exactly our component counts; it is echoed as written.
+    denied : is told the name and the time of a SET that came over another route than it may.
+    counts : "other route" (such SETs), "requests dropped" (more routes at once than a server serves).
     """
 
-    name: str
-    get: Callable[[], float]
-    set: Callable[[float, int], bool] | None = None
-    trigger: bool = False
-
-
-class ParamServer:
-    """Answers for (our system, our component or 0); silent about everybody else's names (S13)."""
-
     def __init__(
-        self, entries: Sequence[Entry], presence: Presence, budget: Budget, values_per_s: float = 50.0
+        self,
+        entries: Sequence[Entry],
+        presence: Presence,
+        budget: Budget,
+        values_per_s: float = 50.0,
+        denied: Callable[[str, int], None] = lambda name, now_ns: None,
     ) -> None:
         self._index = {entry.name: index for index, entry in enumerate(entries)}
         for name in self._index:
@@ -56,7 +53,9 @@ class ParamServer:
             raise ValueError("entries: a name is there twice")
         if not 0 < values_per_s <= 1000:
             raise ValueError(f"values_per_s: want above 0 to 1000, got {values_per_s!r}")
+        self.counts: Counter[str] = Counter()
         self._entries = tuple(entries)
+        self._denied = denied
         self._presence = presence
         self._budget = budget
         self._period_ns = round(_SECOND / values_per_s)
@@ -89,7 +88,7 @@ class ParamServer:
                 break
             index, route = (self._list_at, "") if single is None else single
             message = self._value(index)
-            if not self._budget.take(message, now_ns, reserve=_HEADING_RESERVE):
+            if not self._budget.take(message, now_ns, reserve=self._budget.reserve):
                 break
             if single is None:
                 self._list_at += 1
@@ -126,7 +125,10 @@ class ParamServer:
         by_index = message.param_index >= 0
         index = message.param_index if by_index else self._index.get(message.param_id, -1)
         if 0 <= index < len(self._entries):
-            self._asked[index, route] = None
+            if len(self._asked) < _MOST_ROUTES * len(self._entries):
+                self._asked[index, route] = None
+            else:
+                self.counts["requests dropped"] += 1
             return []
         if message.target_component == 0:
             return []
@@ -143,6 +145,10 @@ class ParamServer:
             error = _READ_ONLY
         elif not math.isfinite(value):
             error = _RANGE
+        elif (entry.trigger or entry.pinned) and not self._may(route):
+            error = _DENIED
+            self.counts["other route"] += 1
+            self._denied(entry.name, now_ns)
         elif entry.trigger:
             error = None if exactly_us else _DENIED
             if exactly_us and not self._is_repeat(entry.name, value, now_ns):
@@ -161,6 +167,11 @@ class ParamServer:
         self._budget.force(answer, now_ns)
         out = [Outgoing(answer)]
         return out if error is None else out + self._error(message, route, index, error, now_ns)
+
+    def _may(self, route: str) -> bool:
+        """What moves a write comes the way the vehicle's own facts come; before there is a vehicle nothing moves."""
+        autopilot = self._presence.autopilot
+        return autopilot is None or route == autopilot.route
 
     def _is_repeat(self, name: str, value: float, now_ns: int) -> bool:
         last = self._triggered.get(name)

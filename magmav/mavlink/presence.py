@@ -25,6 +25,8 @@ _SECOND = 1_000_000_000
 LATCH_NS = 3 * _SECOND
 ROUTE_SILENT_NS = 5 * _SECOND
 CLAIM_NS = 10 * _SECOND
+MOST_SEEN = 256
+_SILENT_NS = 30 * _SECOND
 _BOOT_JUMP_MS = 3000
 _INVALID = dialect.MAV_AUTOPILOT_INVALID
 
@@ -55,7 +57,7 @@ class Presence:
     boots : how often its boot clock jumped back, that is, how often it rebooted.
     """
 
-    def __init__(self, component: int = 191, target_system: int | None = None) -> None:
+    def __init__(self, component: int = 191, target_system: int | None = None, manners: Manners | None = None) -> None:
         if not 1 <= component <= 255:
             raise ValueError(f"component: want 1 to 255, got {component}")
         if target_system is not None and not 1 <= target_system <= 255:
@@ -66,7 +68,7 @@ class Presence:
         self.ambiguous: tuple[int, ...] = ()
         self.second_route = ""
         self.boots = 0
-        self._manners = Manners()
+        self._manners = Manners() if manners is None else manners
         self._seen: dict[tuple[int, int], Autopilot] = {}
         self._first_ns: int | None = None
         self._route_ns = 0  # anything at all from the autopilot over its route
@@ -93,7 +95,21 @@ class Presence:
             self._heard(message, route, now_ns)
         if self.autopilot is None:
             return []  # nobody yet: an answer would carry a made-up system id
-        return self._manners.reply(message, route, self.system, self.component)
+        return self._manners.reply(message, route, self.system, self.component, now_ns)
+
+    def believes(self, message: Message, route: str) -> bool:
+        """Whether this is the word of a vehicle's own autopilot over the route it is pinned to (design, rule 11).
+
+        A system that is not (yet) latched is believed from its lowest component, over the route that came from first.
+        """
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        held = self.autopilot
+        if held is not None and sender[0] == held.system:
+            return (*sender, route) == held.pin
+        seen = self._seen.get(sender)
+        if seen is None or seen.route != route:
+            return False
+        return sender[1] == 1 or sender == min(s for s in self._seen if s[0] == sender[0])
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """Latch when it is time; our heartbeat once a second."""
@@ -102,20 +118,34 @@ class Presence:
             self.second_route = ""
         undecided = self.autopilot is None and self.target_system is None and bool(self._seen)
         if undecided or (self._next_heartbeat_ns is not None and now_ns < self._next_heartbeat_ns):
-            return []
+            return self._manners.poll(now_ns)
         late = self._next_heartbeat_ns is None or now_ns - self._next_heartbeat_ns > _SECOND
         self._next_heartbeat_ns = (now_ns if late else self._next_heartbeat_ns or now_ns) + _SECOND
-        return [Outgoing(_our_heartbeat())]
+        return [Outgoing(_our_heartbeat())]  # and an answer at the next poll, once this is counted
 
     def _is_autopilot(self, message: Message, sender: tuple[int, int]) -> bool:
         if message.autopilot == _INVALID or message.type == dialect.MAV_TYPE_GCS or 0 in sender:
             return False
         return sender[1] != self.component and self.target_system in (None, sender[0])
 
+    def _room(self, sender: tuple[int, int], now_ns: int) -> bool:
+        """However many claim to be an autopilot, few are remembered; a component 1 takes another's place."""
+        if len(self._seen) < MOST_SEEN:
+            return True
+        held = None if self.autopilot is None else self.autopilot.pin[:2]
+        others = [(a.heartbeat_ns, who) for who, a in self._seen.items() if who != held]
+        silent = [who for heard_ns, who in others if now_ns - heard_ns > _SILENT_NS]
+        lesser = [who for _, who in sorted(others) if who[1] != 1 and sender[1] == 1]
+        for who in silent or lesser[:1]:
+            del self._seen[who]
+        return len(self._seen) < MOST_SEEN
+
     def _heartbeat(self, message: Message, sender: tuple[int, int], route: str, now_ns: int) -> None:
         armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         fresh = Autopilot(*sender, message.autopilot, message.type, armed, now_ns, route)
         known = self._seen.get(sender)
+        if known is None and not self._room(sender, now_ns):
+            return
         if self._first_ns is None:
             self._first_ns = now_ns
         if known is None or known.route == route:
