@@ -213,10 +213,10 @@ class Plugin:
     def command(self, words: Sequence[str]) -> None:
         """One command; its answer comes out of ``lines``."""
         if not self._thread.is_alive():
-            self._said.put("magmav is not running; load the module again")
+            self._said.put("not running; load the module again")
             return
         if not self._loaded.is_set():
-            self._said.put("magmav is still loading; the answer follows")
+            self._said.put("still loading; the answer follows")
         self._asked.put(tuple(words))
 
     def lines(self) -> list[str]:
@@ -238,11 +238,12 @@ class Plugin:
                 session = Session.on(self.link, self._settings, self._model, store)
                 desk = Desk(session, store)
                 session.service.watchers += (desk.watch,)
+                self._said.put("at work; magmav help shows the commands")
                 session.service.run(lambda: self._between(desk))
                 if session.companion.job is not None:
-                    self._said.put("magmav stopped in the middle of a write: it is undone when magmav runs again")
+                    self._said.put("stopped in the middle of a write: it is undone when magmav runs again")
         except StoreError as error:
-            self._said.put(f"magmav stopped: {error}")
+            self._said.put(f"stopped: {error}")
 
     def _between(self, desk: Desk) -> bool:
         """Between two packets: commands, answers, news. Never ends the work; closing the link does."""
