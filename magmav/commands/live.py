@@ -43,6 +43,7 @@ def run(o: argparse.Namespace) -> int:
     from magmav.link.open import open_link
     from magmav.link.recorder import TlogRecorder
     from magmav.live import Session
+    from magmav.notify import Notifier
     from magmav.store import Store, default_path
     from magmav.view.records import RecordWriter
     from magmav.view.reporter import Reporter
@@ -68,7 +69,19 @@ def run(o: argparse.Namespace) -> int:
         port = getattr(link, "port", None)
         _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {port})" if port else "")
         until = _Deadline(o.for_s)
-        session.service.run(lambda: stopped() or until(session.service.now_ns))
+        notifier = Notifier.from_environment()
+        notifier.ready(f"listening on {link.name}")
+
+        def over() -> bool:
+            """Asked after every packet and quiet tick, so who watches us sees that the work goes on."""
+            ends = stopped() or until(session.service.now_ns)
+            if ends:
+                notifier.stopping()
+            else:
+                notifier.beat(session.service.now_ns)
+            return ends
+
+        session.service.run(over)
     return 0
 
 
