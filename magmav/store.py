@@ -13,66 +13,33 @@ import json
 import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from magmav.core.types import AxisState, Change, Reason, State, UploadResult, Verdict
+from magmav.core.types import Change, Reason, UploadResult
+from magmav.mavlink.kept import Keeping
+from magmav.mavlink.uid import may_be_same
+from magmav.store_rows import (
+    ESTIMATE_COLUMNS,
+    WRITE_COLUMNS,
+    SavedEstimate,
+    Write,
+    estimate_of,
+    estimate_row,
+    pack,
+    unpack,
+    write_of,
+)
+from magmav.store_schema import StoreError, connect
 
-FORMAT = 1
-_TABLES = """
-CREATE TABLE writes (
-    id INTEGER PRIMARY KEY, unix_ns INTEGER NOT NULL, system INTEGER NOT NULL, compass INTEGER NOT NULL,
-    device_id INTEGER NOT NULL, vehicle TEXT NOT NULL, change TEXT NOT NULL,
-    undoes INTEGER REFERENCES writes(id), result TEXT, reasons TEXT NOT NULL DEFAULT '[]',
-    settled INTEGER NOT NULL DEFAULT 0, undone INTEGER NOT NULL DEFAULT 0
-);
-CREATE TABLE estimates (
-    system INTEGER NOT NULL, device_id INTEGER NOT NULL, unix_ns INTEGER NOT NULL, vehicle TEXT NOT NULL,
-    change TEXT NOT NULL, verdict TEXT NOT NULL, offsets_mg TEXT NOT NULL, sigma_mg TEXT NOT NULL,
-    PRIMARY KEY (system, device_id)
-);
-"""
-_KNOWN = (UploadResult.ALL_NEW, UploadResult.ALL_OLD)
+__all__ = ["SavedEstimate", "Store", "StoreBusy", "StoreError", "Write", "default_path"]
+_KNOWN = (UploadResult.ALL_NEW, UploadResult.WRITTEN_UNPROVEN, UploadResult.ALL_OLD)
 _T = TypeVar("_T")
-
-
-class StoreError(OSError):
-    """The store cannot be opened, read or written; the text names the file and the cause."""
 
 
 class StoreBusy(StoreError, BlockingIOError):
     """Another process is in the middle of a write to a vehicle."""
-
-
-@dataclass(frozen=True, slots=True)
-class Write:
-    """One write to a vehicle; result None: cut short. Upload(change, ..., undoes=id) undoes it."""
-
-    id: int
-    unix_ns: int
-    vehicle: str
-    change: Change
-    undoes: int | None
-    result: UploadResult | None
-    reasons: tuple[Reason, ...]
-    undone: bool  # its old values were brought back later
-
-
-@dataclass(frozen=True, slots=True)
-class SavedEstimate:
-    """The latest answer for one compass: what an upload would change, and how good it is.
-
-    offsets_mg, sigma_mg : (x, y, z), mG, body axes, as ArduPilot would add them.
-    """
-
-    unix_ns: int
-    vehicle: str
-    change: Change
-    verdict: Verdict
-    offsets_mg: tuple[float, float, float]
-    sigma_mg: tuple[float, float, float]
 
 
 def default_path(environ: Mapping[str, str] | None = None) -> Path:
@@ -101,7 +68,7 @@ class Store:
             except OSError as error:
                 raise StoreError(f"{self.path}: its folder cannot be made ({error.strerror})") from error
             try:
-                self._db = self._connect()
+                self._db = connect(self.path)
             except sqlite3.Error as error:
                 raise StoreError(f"{self.path}: {error}") from error
         return self
@@ -126,7 +93,7 @@ class Store:
     def begin(self, change: Change, unix_ns: int, undoes: int | None = None, vehicle: str = "") -> int:
         """Put a change on record, on disk when this returns; StoreBusy while another process is writing."""
         self._claim()
-        row = (unix_ns, change.system, change.compass, change.device_id, vehicle, _pack(change), undoes)
+        row = (unix_ns, change.system, change.compass, change.device_id, vehicle, pack(change), undoes)
         columns = "unix_ns, system, compass, device_id, vehicle, change, undoes"
         sql = f"INSERT INTO writes ({columns}) VALUES (?,?,?,?,?,?,?)"
         try:
@@ -165,14 +132,35 @@ class Store:
         """The user looked at a pending write and wants it left as it is."""
         self._do(lambda db: db.execute("UPDATE writes SET settled=1 WHERE id=?", (row,)))
 
-    def last_restorable(self, system: int, compass: int, device_id: int) -> Write | None:
-        """The newest write whose old values can still be brought back, for exactly this compass."""
+    def last_restorable(self, system: int, compass: int, device_id: int, vehicle: str = "") -> Write | None:
+        """The newest write whose old values can still be brought back, for exactly this compass.
+
+        vehicle : key of the vehicle; writes to one that is another for certain do not count (S19).
+        """
         where = (
             "system=? AND compass=? AND device_id=? AND NOT undone AND undoes IS NULL AND (result IN "
             "('ALL_NEW', 'WRITTEN_UNPROVEN') OR (ifnull(result, 'PENDING_RESTORE')='PENDING_RESTORE' "
-            "AND NOT settled)) ORDER BY id DESC LIMIT 1"
+            "AND NOT settled)) ORDER BY id DESC"
         )
-        return next(iter(self._writes(where, (system, compass, device_id))), None)
+        rows = self._writes(where, (system, compass, device_id))
+        return next((row for row in rows if not vehicle or may_be_same(row.vehicle, vehicle)), None)
+
+    def ended_at(self, row: int, boot_ms: int) -> None:
+        """The autopilot's boot clock when this write ended: a smaller one later means that it rebooted since."""
+        self._do(lambda db: db.execute("UPDATE writes SET boot_ms=? WHERE id=?", (boot_ms, row)))
+
+    def unchecked(self, system: int) -> list[Write]:
+        """The latest write to each compass that left known values and was not looked at again after a reboot."""
+        where = "system=? AND result IN ('ALL_NEW', 'WRITTEN_UNPROVEN', 'ALL_OLD', 'PENDING_RESTORE') ORDER BY id DESC"
+        latest: dict[tuple[str, int], Write] = {}
+        for row in self._writes(where, (system,)):
+            latest.setdefault((row.vehicle, row.change.device_id), row)
+        whole = (UploadResult.ALL_NEW, UploadResult.WRITTEN_UNPROVEN, UploadResult.ALL_OLD)
+        return [r for r in latest.values() if r.kept is None and r.boot_ms is not None and r.result in whole]
+
+    def checked(self, row: int, kept: Keeping) -> None:
+        """What was found after the reboot."""
+        self._do(lambda db: db.execute("UPDATE writes SET kept=? WHERE id=?", (kept.name, row)))
 
     def history(self, limit: int = 50) -> list[Write]:
         """The latest writes, newest first."""
@@ -181,62 +169,22 @@ class Store:
     # ------------------------------------------------------------ estimates
 
     def save_estimate(self, estimate: SavedEstimate) -> None:
-        """Keep the latest per system and device id."""
-        verdict = {
-            "state": estimate.verdict.state.name,
-            "axes": [axis.name for axis in estimate.verdict.axes],
-            "reasons": [reason.name for reason in estimate.verdict.reasons],
-        }
-        row = (
-            estimate.change.system,
-            estimate.change.device_id,
-            estimate.unix_ns,
-            estimate.vehicle,
-            _pack(estimate.change),
-            json.dumps(verdict),
-            json.dumps(estimate.offsets_mg),
-            json.dumps(estimate.sigma_mg),
-        )
-        self._do(lambda db: db.execute("INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?,?,?,?)", row))
+        """Keep the latest per vehicle and device id."""
+        place = estimate.change.system, estimate.change.device_id
+        sql = f"INSERT OR REPLACE INTO estimates (system, device_id, {ESTIMATE_COLUMNS}) VALUES (?,?,?,?,?,?,?,?)"
+        self._do(lambda db: db.execute(sql, (*place, *estimate_row(estimate))))
 
-    def latest_estimate(self, system: int, device_id: int) -> SavedEstimate | None:
-        """What was learnt last about this very compass, or None."""
-        sql = (
-            "SELECT unix_ns, vehicle, change, verdict, offsets_mg, sigma_mg FROM estimates "
-            "WHERE system=? AND device_id=?"
-        )
-        found = self._do(lambda db: db.execute(sql, (system, device_id)).fetchone())
-        return None if found is None else self._read(_saved, found)
+    def latest_estimate(self, system: int, device_id: int, vehicle: str = "") -> SavedEstimate | None:
+        """What was learnt last about this very compass, or None.
+
+        vehicle : key of the vehicle; what is of another one for certain does not count (S19).
+        """
+        sql = f"SELECT {ESTIMATE_COLUMNS} FROM estimates WHERE system=? AND device_id=? ORDER BY unix_ns DESC"
+        found = self._do(lambda db: db.execute(sql, (system, device_id)).fetchall())
+        saved = (self._read(estimate_of, row) for row in found)
+        return next((one for one in saved if not vehicle or may_be_same(one.vehicle, vehicle)), None)
 
     # ------------------------------------------------------------ inside
-
-    def _connect(self) -> sqlite3.Connection:
-        db = sqlite3.connect(self.path, isolation_level=None, timeout=5.0)
-        try:
-            db.execute("BEGIN")  # both at one instant: another process may be creating it right now
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-            db.execute("COMMIT")
-            if version == 0 and tables:
-                raise StoreError(f"{self.path}: a database of something else, not a magmav store")
-            if version > FORMAT:
-                raise StoreError(f"{self.path}: format {version} is newer than this magmav's {FORMAT}; update magmav")
-            db.execute("PRAGMA journal_mode=WAL")
-            db.execute("PRAGMA synchronous=FULL")
-            if version == 0:
-                self._create(db)
-        except BaseException:
-            db.close()
-            raise
-        return db
-
-    def _create(self, db: sqlite3.Connection) -> None:
-        db.execute("BEGIN IMMEDIATE")
-        if db.execute("PRAGMA user_version").fetchone()[0] == 0:  # nobody else was quicker
-            for statement in filter(str.strip, _TABLES.split(";")):
-                db.execute(statement)
-            db.execute(f"PRAGMA user_version={FORMAT}")
-        db.execute("COMMIT")
 
     def _do(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
         """Run in one transaction; whatever goes wrong, nothing of it stays."""
@@ -255,8 +203,8 @@ class Store:
         return out
 
     def _writes(self, where: str, values: tuple[int, ...] = ()) -> list[Write]:
-        sql = f"SELECT id, unix_ns, vehicle, change, undoes, result, reasons, undone FROM writes WHERE {where}"
-        return [self._read(_write, row) for row in self._do(lambda db: db.execute(sql, values).fetchall())]
+        sql = f"SELECT {WRITE_COLUMNS} FROM writes WHERE {where}"
+        return [self._read(write_of, row) for row in self._do(lambda db: db.execute(sql, values).fetchall())]
 
     def _read(self, make: Callable[[Sequence[Any]], _T], row: Sequence[Any]) -> _T:
         try:
@@ -298,13 +246,13 @@ class Store:
 def _settle(db: sqlite3.Connection, row: int) -> None:
     """Earlier writes of no other names than this one's: the vector is known to be whole again."""
     this = db.execute("SELECT system, device_id, change FROM writes WHERE id=?", (row,)).fetchone()
-    names = set(_unpack(this[2]).names)
+    names = set(unpack(this[2]).names)
     earlier = db.execute(
         "SELECT id, change FROM writes WHERE id<? AND system=? AND device_id=? AND NOT settled",
         (row, *this[:2]),
     ).fetchall()
     for other, change in earlier:
-        if names >= set(_unpack(change).names):
+        if names >= set(unpack(change).names):
             db.execute("UPDATE writes SET settled=1 WHERE id=?", (other,))
 
 
@@ -314,35 +262,3 @@ def _mark_undone(db: sqlite3.Connection, row: int) -> None:
     while found is not None and found[0] is not None:
         db.execute("UPDATE writes SET undone=1 WHERE id=?", found)
         found = db.execute("SELECT undoes FROM writes WHERE id=?", found).fetchone()
-
-
-def _pack(change: Change) -> str:
-    """JSON; every float32 survives exactly: Python writes doubles so that they read back the same."""
-    return json.dumps(asdict(change), allow_nan=False)
-
-
-def _unpack(text: str) -> Change:
-    held: dict[str, Any] = json.loads(text)
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in held.items()}
-    return Change(**fields)
-
-
-def _write(row: Sequence[Any]) -> Write:
-    number, unix_ns, vehicle, change, undoes, result, reasons, undone = row
-    named = tuple(Reason[name] for name in json.loads(reasons))
-    ended = None if result is None else UploadResult[result]
-    return Write(number, unix_ns, vehicle, _unpack(change), undoes, ended, named, bool(undone))
-
-
-def _saved(row: Sequence[Any]) -> SavedEstimate:
-    unix_ns, vehicle, change, verdict, offsets_mg, sigma_mg = row
-    said = json.loads(verdict)
-    x, y, z = (AxisState[name] for name in said["axes"])
-    judged = Verdict(State[said["state"]], (x, y, z), tuple(Reason[name] for name in said["reasons"]))
-    offsets, sigma = (tuple(map(float, json.loads(text))) for text in (offsets_mg, sigma_mg))
-    return SavedEstimate(unix_ns, vehicle, _unpack(change), judged, _three(offsets), _three(sigma))
-
-
-def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
-    x, y, z = values
-    return x, y, z

@@ -7,25 +7,29 @@ cut short (design, rule 10).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult
 from magmav.mavlink.announce import Announcer
 from magmav.mavlink.autopilot.ardupilot import plan_change
-from magmav.mavlink.change import code_needed, largest_step_mg
+from magmav.mavlink.change import adapter_for, code_needed, largest_step_mg
 from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.kept import Keeping, Kept
 from magmav.mavlink.terms import UploadSettings
+from magmav.mavlink.uid import Uid, has_uid, may_be_same
 from magmav.mavlink.upload import Upload
 from magmav.mavlink.watch import Watch
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings
-from magmav.store import Store, StoreError
+from magmav.store import Store, StoreError, Write
 from magmav.vehicle import Vehicle as Flown
 
 _log = logging.getLogger("magmav")
 STALE_NS = 2_000_000_000
 _RETRY_RESTORE_NS = 30_000_000_000
+_ASK_AGAIN_NS = 500_000_000
 _CRITICAL, _WARNING, _INFO = 2, 4, 6
+_WHOLE = (UploadResult.ALL_NEW, UploadResult.WRITTEN_UNPROVEN, UploadResult.ALL_OLD)
 _NOT_OURS = frozenset({Reason.OFFSETS_CHANGED, Reason.DEVICE_CHANGED, Reason.WRONG_VEHICLE})
 
 
@@ -66,8 +70,22 @@ class Writer:
         self._retry_ns = 0
         self._restoring: int | None = None
         self._left_alone: set[int] = set()
+        self._uid = Uid(watch.presence)
+        self._boot_ms: int | None = None
+        self._kept: dict[int, tuple[Write, Kept]] = {}  # by device id
+        self._looked_for = ""  # the vehicle whose earlier writes were looked up
 
     # ------------------------------------------------------------ what is asked of it
+
+    @property
+    def vehicle(self) -> str:
+        """Key of the served vehicle in the store: its system id, and its own number where that is known (S19)."""
+        return self._uid.key
+
+    @property
+    def identified(self) -> bool:
+        """Its number is known, or it was asked often enough."""
+        return self._uid.settled
 
     def flown(self) -> Flown | None:
         """The served vehicle in the pipeline."""
@@ -83,11 +101,11 @@ class Writer:
         record = self.fresh(compass, now_ns)
         change = self.plan(compass)
         if self.job is not None or not self._serves:
-            self._refuse(Reason.BUSY, now_ns)
+            self.refuse(Reason.BUSY, now_ns)
         elif record is None or record.verdict.state is not State.READY:
-            self._refuse(Reason.NO_CALIBRATION, now_ns)
+            self.refuse(Reason.NO_CALIBRATION, now_ns)
         elif change is None:
-            self._refuse(Reason.NOT_OBSERVED, now_ns)
+            self.refuse(Reason.NOT_OBSERVED, now_ns)
         else:
             self.start(change, int(self.confirm), now_ns)
 
@@ -95,11 +113,11 @@ class Writer:
         """Bring back the values from before the last upload of this compass."""
         flown = self.flown()
         device = 0 if flown is None else flown.calibrations.device_id(compass)
-        row = self._store.last_restorable(self._presence.system, compass, device)
+        row = self._store.last_restorable(self._presence.system, compass, device, self.vehicle)
         if self.job is not None or not self._serves:
-            self._refuse(Reason.BUSY, now_ns)
+            self.refuse(Reason.BUSY, now_ns)
         elif row is None:
-            self._refuse(Reason.NO_SNAPSHOT, now_ns)
+            self.refuse(Reason.NO_SNAPSHOT, now_ns)
         else:
             self.start(row.change, None, now_ns, undoes=row.id)
 
@@ -118,18 +136,20 @@ class Writer:
             raise ValueError("start: a write is under way; wait for its end")
         limits = UploadSettings(confirm_above_mg=self._settings().upload.confirm_above_mg)
         self.refusal = None
+        flown = self.flown()
+        self._kept.pop(change.device_id, None)
         self.job = Upload(
             change,
             self._watch,
             journal=self._store,
             confirm=confirm,
             undoes=undoes,
-            vehicle=str(change.system),
+            vehicle=self.vehicle,
+            against=None if flown is None else flown.calibrations.refuses(change.compass),
             unix_offset_ns=self._unix_offset_ns,
             settings=limits,
         )
         self.result = 1.0
-        flown = self.flown()
         if flown is not None:
             # The stream will jump by what we ourselves write: undone exactly, nothing is learnt again.
             flown.calibrations.expect(change.names, change.old)
@@ -141,25 +161,35 @@ class Writer:
 
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
         """For the write under way."""
+        autopilot = self._presence.autopilot
+        sender = message.get_srcSystem(), message.get_srcComponent(), route
+        if autopilot is not None and sender == autopilot.pin:
+            self._boot_ms = getattr(message, "time_boot_ms", self._boot_ms)
+        self._uid.on_message(message, route)
+        for _, kept in self._kept.values():
+            kept.on_message(message, route, now_ns)
         return [] if self.job is None else self.job.on_message(message, route, now_ns)
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """What the write under way sends; without one, see whether an earlier one is to be taken back."""
-        out: list[Outgoing] = []
+        out = self._uid.poll(now_ns)
         if self.job is not None:
             flown = self.flown()
             if flown is not None:
                 flown.settle(self.job.change.compass)  # the stream jumps a moment before the echo says so
-            out = self.job.poll(now_ns)
+            out += self.job.poll(now_ns)
             self._finish(self.job, now_ns)
         elif self._serves and now_ns >= self._retry_ns:
             self._restore_pending(now_ns)
+        if self.job is None and self._serves:
+            out += self._look_again(now_ns)
         return out
 
     def _finish(self, job: Upload, now_ns: int) -> None:
         if job.result is None:
             return
         self.job, self.ended = None, job
+        self._await_reboot(job)
         if self._restoring is not None and _NOT_OURS.intersection(job.reasons):
             # Somebody else's values are there now: never overwritten unasked (design, rule 10).
             self._left_alone.add(self._restoring)
@@ -180,7 +210,8 @@ class Writer:
             step = largest_step_mg(job.change)
             self._announcer.say(_WARNING, f"MMAG change of {step:.0f} mG: MMAG_CONFIRM {code_text}", now_ns)
 
-    def _refuse(self, reason: Reason, now_ns: int) -> None:
+    def refuse(self, reason: Reason, now_ns: int) -> None:
+        """Say why nothing is begun."""
         self.refusal = reason
         if self.job is None:  # while a write runs, the result is that it runs
             self.result = -float(reason.number)
@@ -197,8 +228,60 @@ class Writer:
         except StoreError as error:
             _log.error("%s", error)
             return
-        rows = [r for r in rows if r.id not in self._left_alone]
+        rows = [r for r in rows if r.id not in self._left_alone and may_be_same(r.vehicle, self.vehicle)]
+        if rows and not self.identified and has_uid(rows[0].vehicle):
+            self._retry_ns = now_ns + _ASK_AGAIN_NS  # another vehicle with the same numbers is soon told apart (S19)
+            return
         if rows:
             self._restoring = rows[0].id
             self._announcer.say(_WARNING, "MMAG restoring a write that was cut short", now_ns)
             self.start(rows[0].change, None, now_ns, undoes=rows[0].id)
+
+    # ------------------------------------------------------------ after a reboot
+
+    def _await_reboot(self, job: Upload) -> None:
+        """Note the autopilot's clock with a write that left known values; see Kept."""
+        if job.row is None or self._boot_ms is None or job.result not in _WHOLE:
+            return
+        try:
+            self._store.ended_at(job.row, self._boot_ms)
+            rows = self._store.unchecked(self._presence.system)
+        except StoreError as error:
+            _log.error("%s", error)
+            return
+        self._watch_over([row for row in rows if row.id == job.row])
+
+    def _watch_over(self, rows: Iterable[Write]) -> None:
+        for row in rows:
+            if row.boot_ms is None or not may_be_same(row.vehicle, self.vehicle):
+                continue
+            old, new = (dict(zip(row.change.names, v, strict=True)) for v in (row.change.old, row.change.new))
+            written, before = (old, new) if row.result is UploadResult.ALL_OLD else (new, old)
+            kept = Kept(adapter_for(row.change), self._presence, written, before, row.boot_ms)
+            self._kept[row.change.device_id] = row, kept
+
+    def _look_again(self, now_ns: int) -> list[Outgoing]:
+        """Writes of earlier companions are looked up once; then each is read once the autopilot has rebooted."""
+        if self._presence.autopilot is None or not self.identified:
+            return []
+        out: list[Outgoing] = []
+        try:
+            if self._looked_for != self.vehicle:
+                self._looked_for = self.vehicle
+                self._watch_over(self._store.unchecked(self._presence.system))
+            for device, (row, kept) in tuple(self._kept.items()):
+                out += kept.poll(now_ns)
+                if kept.found is not None:
+                    self._store.checked(row.id, kept.found)
+                    self._say_kept(row, kept.found, now_ns)
+                if kept.found is not None or kept.given_up:
+                    del self._kept[device]
+        except StoreError as error:
+            _log.error("%s", error)
+            self._kept.clear()
+        return out
+
+    def _say_kept(self, row: Write, found: Keeping, now_ns: int) -> None:
+        text = f"MMAG c{row.change.compass} {found.name}: {found.value}"
+        _log.log(logging.INFO if found is Keeping.PERSISTED else logging.WARNING, "%s", text)
+        self._announcer.say(_INFO if found is Keeping.PERSISTED else _WARNING, text, now_ns)

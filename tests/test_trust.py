@@ -81,7 +81,8 @@ def test_AT_17a_learning_touches_no_parameter_and_commands_nothing(first):
         "HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "PARAM_VALUE", "NAMED_VALUE_FLOAT", "STATUSTEXT",
     }  # fmt: skip
     commands = {m.command for m in first.sent if m.get_type() == "COMMAND_LONG"}
-    assert commands == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
+    who_are_you = {dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES}
+    assert commands == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL} | who_are_you
     own = {m.param_id for m in first.sent if m.get_type() == "PARAM_VALUE"}
     assert all(name.startswith("MMAG_") for name in own)
     assert first.companion.job is None is first.companion.ended

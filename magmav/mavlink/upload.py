@@ -17,8 +17,6 @@ change, for an undo too (an undo that works ends ALL_OLD). REFUSED: nothing was 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.core.types import Change, Reason, UploadResult
@@ -40,7 +38,7 @@ class Upload:
     """One change, or with ``undoes`` (the journal row it undoes) its way back. Feed it everything.
 
     watch : long-lived, may be fed by others too.  confirm : the code, for a change above 150 mG (never asked
-    of an undo).  vehicle : key for the journal.  known : parameters heard before, to see two compasses with one id.
+    of an undo).  vehicle : key for the journal.  against : what those who know more of this vehicle have against it.
     row : of the journal, once there is one.  result : None until the end; ``reasons`` say why.
     """
 
@@ -55,7 +53,7 @@ class Upload:
         vehicle: str = "",
         unix_offset_ns: int = 0,
         settings: UploadSettings | None = None,
-        known: Mapping[str, float] | None = None,
+        against: Reason | None = None,
     ) -> None:
         self._adapter = changes.adapter_for(change)
         self.change = self._adapter.checked(change)
@@ -84,7 +82,7 @@ class Upload:
             Phase.PROOF: self._proof,
             Phase.ARMING: self._arming,
         }
-        self._known = dict(known or {})
+        self._against = against
         self._streams = self._adapter.proof_streams(change.compass)
         self._talk = Dialogue(self._adapter, (0, 0, ""), ())
         self._arming_check: ArmingCheck | None = None
@@ -133,8 +131,7 @@ class Upload:
             why.append(Reason.NOTHING_TO_DO)
         elif not self._undo and changes.is_too_small(self.change):
             why.append(Reason.TOO_SMALL)
-        if self._adapter.ambiguous(self.change, self._known):
-            why.append(Reason.MAPPING_UNCLEAR)
+        why += [] if self._against is None else [self._against]
         why += self._value_refusals()
         code = None if self._undo else changes.code_needed(self.change, self._set.confirm_above_mg)
         if code is not None and self._confirm != code:
