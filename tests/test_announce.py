@@ -151,7 +151,7 @@ def test_a_full_queue_drops_the_least_important() -> None:
     assert bench.announcer.counts["dropped"] == 1
 
 
-def test_AT9c_everything_together_stays_at_or_under_500_bytes_a_second() -> None:
+def test_AT_9c_everything_together_stays_at_or_under_500_bytes_a_second() -> None:
     """Heartbeat, headings of three compasses, chatter, lists and reads for a minute; real encoded frames."""
     bench = Bench(heading_hz=10.0)
     presence = Presence(target_system=7)

@@ -92,7 +92,7 @@ def test_denied_is_remembered() -> None:
     assert bench.machine.refused == {"HIGHRES_IMU"}
 
 
-def test_AT9b_a_rate_that_drops_is_asked_for_again_ever_more_rarely() -> None:
+def test_AT_9b_a_rate_that_drops_is_asked_for_again_ever_more_rarely() -> None:
     bench = Bench({"RAW_IMU": 10.0})
     bench.rate_hz = {"RAW_IMU": 10.0}
     bench.run(20.0)
@@ -113,7 +113,7 @@ def test_AT9b_a_rate_that_drops_is_asked_for_again_ever_more_rarely() -> None:
     assert bench.asked[count][0] - begin <= 85.0
 
 
-def test_AT9b_never_twice_in_ten_seconds_after_the_start() -> None:
+def test_AT_9b_never_twice_in_ten_seconds_after_the_start() -> None:
     bench = Bench({"RAW_IMU": 10.0, "ATTITUDE": 10.0})
     bench.run(400.0)
     for message_id in (RAW_IMU, ATTITUDE):

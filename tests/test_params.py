@@ -130,7 +130,7 @@ def test_read_by_name_and_by_index() -> None:
         assert [(m.param_id, m.param_index, m.param_count, m.param_value) for m in answer] == [("MMAG_RATE", 2, 5, 2.0)]
 
 
-def test_AT9a_a_full_list_survives_thirty_percent_loss_by_index() -> None:
+def test_AT_9a_a_full_list_survives_thirty_percent_loss_by_index() -> None:
     bench = Bench(extra=25)
     import random
 
