@@ -257,3 +257,76 @@ def test_pymavlinks_own_client_reads_and_lists():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert "[('empty', 0), ('general.json', 13), ('parameter.json', 1280)]" in done.stdout
+
+
+class Hasty:
+    """A client with MAVSDK's habits, as its source reads: session 0 always, 0.5 s, ten tries, and no patience.
+
+    A burst that stalls is finished by reads of what is missing; an answer at an offset it does not wait for ends it.
+    """
+
+    def __init__(self, server_hear, server_poll, latency_ns):
+        self.hear, self.poll, self.latency_ns = server_hear, server_poll, latency_ns
+        self.now_ns, self.sequence, self.tries = 10 * S, 0, 10
+        self.out, self.size, self.reading = b"", -1, False
+        self.opcode, self.due_ns, self.seen = OPEN, 0, -1
+        self.up, self.down = [], []
+
+    def send(self, opcode, data=b"", **fields):
+        self.opcode, self.due_ns = opcode, self.now_ns + S // 2
+        message = WIRE.carry(request(opcode, self.sequence, data, **fields), 255, 190)
+        self.sequence += 1
+        self.up.append((self.now_ns + self.latency_ns, message))
+
+    def more(self):
+        if len(self.out) == self.size:
+            self.send(TERMINATE)
+        elif self.reading:
+            self.send(READ, size=min(239, self.size - len(self.out)), offset=len(self.out))
+        else:
+            self.send(BURST, size=239, offset=len(self.out))
+
+    def take(self, answer):
+        if answer.request != self.opcode or answer.sequence == self.seen:
+            return
+        self.seen, self.tries = answer.sequence, 10
+        assert answer.opcode == ACK
+        if answer.request == OPEN:
+            self.size = int.from_bytes(answer.data, "little")
+        elif answer.request in (READ, BURST):
+            assert answer.offset == len(self.out), "it would give up here"
+            self.out += answer.data
+        else:
+            self.opcode = -1
+            return
+        self.more()
+
+    def download(self, path):
+        self.send(OPEN, path + b"\0")
+        while self.opcode != -1:
+            self.now_ns += 10 * MS
+            while self.up and self.up[0][0] <= self.now_ns:
+                self.hear(self.up.pop(0)[1], "gcs", self.now_ns)
+            for item in self.poll(self.now_ns):
+                payload = bytes(WIRE.carry(item.message, 7, 191).payload)
+                self.down.append((self.now_ns + self.latency_ns, parsed(payload)))
+            while self.down and self.down[0][0] <= self.now_ns:
+                self.take(self.down.pop(0)[1])
+            if self.opcode != -1 and self.now_ns >= self.due_ns:
+                self.tries -= 1
+                assert self.tries > 0, "timed out"
+                if self.opcode == OPEN:
+                    self.send(OPEN, path + b"\0")
+                else:
+                    self.reading = self.reading or bool(self.out)
+                    self.more()
+        return self.out
+
+
+@pytest.mark.parametrize("latency_ms", [0, 20, 60])
+@pytest.mark.parametrize("bps", [300.0, 500.0, 5000.0])
+def test_a_hasty_client_gets_its_file_on_a_slow_budget(bps, latency_ms):
+    """It asks again before the budget lets an answer go: only the newest question is answered, so none comes twice."""
+    server, patient = serving(bps=bps)
+    client = Hasty(server.on_message, patient.poll, latency_ms * MS)
+    assert client.download(b"parameter.json") == FILES["parameter.json"]

@@ -170,7 +170,7 @@ def test_set_is_echoed_at_once_with_true_index_to_everybody() -> None:
 
 @pytest.mark.parametrize(("name", "value", "old", "error"), [
     ("MMAG_OFS_X", 3.0, f32(0.1), 5), ("MMAG_RATE", 51.0, 2.0, 2), ("MMAG_RATE", NAN, 2.0, 2),
-    ("MMAG_RATE", math.inf, 2.0, 2), ("MMAG_UPLOAD", NAN, 0.0, 2),
+    ("MMAG_RATE", math.inf, 2.0, 2), ("MMAG_UPLOAD", NAN, 0.0, 2), ("MMAG_RATE", 7e-45, 2.0, 2),
 ])  # fmt: skip
 def test_a_refused_set_gives_the_old_value_and_the_reason(name: str, value: float, old: float, error: int) -> None:
     bench = Bench()

@@ -23,6 +23,7 @@ _SECOND = 1_000_000_000
 TRIGGER_QUIET_NS = 30 * _SECOND
 GROUND_GONE_NS = 60 * _SECOND
 _MOST_ROUTES = 16
+_LEAST = 1e-30  # a number below is an integer's bits, sent as if these parameters were integers
 _MOST_DEBT_S = 2.0  # a SET is echoed at once unless somebody floods us
 _MISSING = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 _RANGE = dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
@@ -143,7 +144,7 @@ class ParamServer:
         error = None
         if entry.set is None:
             error = _READ_ONLY
-        elif not math.isfinite(value):
+        elif not math.isfinite(value) or 0.0 < abs(value) < _LEAST:
             error = _RANGE
         elif (entry.trigger or entry.pinned) and not self._may(route):
             error = _DENIED
