@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult
 from magmav.mavlink.announce import Announcer
-from magmav.mavlink.autopilot.ardupilot import plan_change
+from magmav.mavlink.autopilot.plan import plan_change
 from magmav.mavlink.change import adapter_for, code_needed, largest_step_mg
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.kept import Keeping, Kept
