@@ -43,6 +43,8 @@ class Wire:
 class Vehicle:
     """One ArduPilot with one compass, stepped every 20 ms. Knobs are the failures."""
 
+    kind = 3  # MAV_AUTOPILOT
+
     def __init__(self, seed: int = 0) -> None:
         self.random = random.Random(seed)
         self.now_ns = 100 * S
@@ -120,12 +122,25 @@ class Vehicle:
         if name not in self.params:
             return
         if kind == "PARAM_SET":
-            self.params[name] = f32(message.param_value)
+            self.params[name] = self._value_in(message)
             if self.applies:
                 self.applied[name] = self.params[name]
-        self.say(dialect.MAVLink_param_value_message(name.encode(), self.params[name], 9, 1000, 65535))
+        self.say(self._value_out(name))
         if kind == "PARAM_SET":
             self.on_set(name)
+
+    def _value_in(self, message: Any) -> float:
+        return f32(message.param_value)
+
+    def _value_out(self, name: str) -> Any:
+        return dialect.MAVLink_param_value_message(name.encode(), self.params[name], 9, 1000, 65535)
+
+    def _imu(self) -> Any:
+        mag = [
+            math.trunc(b + self.applied[f"COMPASS_OFS_{axis}"] + self.random.gauss(0, self.noise_mg))
+            for b, axis in zip(self.field, "XYZ", strict=True)
+        ]
+        return dialect.MAVLink_raw_imu_message(self.now_ns // 1000, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
 
     def _command(self, message: Any) -> None:
         """MAV_CMD_RUN_PREARM_CHECKS is all it knows: acknowledged, and a text for what would not pass."""
@@ -137,7 +152,7 @@ class Vehicle:
 
     def heartbeat(self, armed: bool | None = None) -> Any:
         base = 128 if (self.armed if armed is None else armed) else 0
-        return dialect.MAVLink_heartbeat_message(2, 3, base | 1, 0, 4, 3)
+        return dialect.MAVLink_heartbeat_message(2, self.kind, base | 1, 0, 4, 3)
 
     def _talk(self, tick: int) -> None:
         if tick % 50 == 0 and self.heartbeats:
@@ -150,12 +165,7 @@ class Vehicle:
         if tick % 50 == 7 and self.calibrating:
             self.say(dialect.MAVLink_mag_cal_progress_message(0, 1, 2, 1, 30, [0] * 10, 0, 0, 0))
         if tick % 5 == 0 and self.streams:
-            mag = [
-                math.trunc(b + self.applied[f"COMPASS_OFS_{axis}"] + self.random.gauss(0, self.noise_mg))
-                for b, axis in zip(self.field, "XYZ", strict=True)
-            ]
-            gyro = self.gyro_mrads
-            self.say(dialect.MAVLink_raw_imu_message(self.now_ns // 1000, 0, 0, -1000, gyro, 0, 0, *mag))
+            self.say(self._imu())
 
     def run(self, machine: Any, until_s: float = 150.0, feed: Callable[..., Any] | None = None) -> None:
         """Step until the machine has a result, or the time is over. ``feed`` sees every message first."""
@@ -179,3 +189,45 @@ class Vehicle:
             if machine is not None:
                 self.receive(machine.poll(self.now_ns))
             self.now_ns += 20 * MS
+
+
+class Px4Vehicle(Vehicle):
+    """One PX4 with one compass in slot 1, from what is known of its source (autopilots.md section 4).
+
+    Numbers travel byte-wise, so an int32 of -1 is a NaN; offsets are gauss, subtracted, in the sensor's axes;
+    SCALED_IMU is the sensor's own field whatever is stored; an unknown name gets a text and nothing else.
+    """
+
+    kind = 12
+    INTS = ("CAL_MAG0_ID", "CAL_MAG1_ID", "CAL_MAG2_ID", "CAL_MAG3_ID", "CAL_MAG1_ROT", "SENS_MAG_AUTOCAL")
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__(seed)
+        self.params = {
+            "CAL_MAG0_ID": 396809.0,
+            "CAL_MAG1_ID": 97539.0,
+            "CAL_MAG2_ID": 0.0,
+            "CAL_MAG3_ID": 0.0,
+            "CAL_MAG1_ROT": -1.0,
+            "CAL_MAG1_XOFF": f32(0.0053),
+            "CAL_MAG1_YOFF": f32(-0.0121),
+            "CAL_MAG1_ZOFF": f32(0.0407),
+            "SENS_MAG_AUTOCAL": 0.0,
+        }
+        self.applied = dict(self.params)
+
+    def _imu(self) -> Any:
+        mag = [round(b + self.random.gauss(0, self.noise_mg)) for b in self.field]
+        return dialect.MAVLink_scaled_imu_message((self.now_ns // MS) % 2**32, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
+
+    def _value_in(self, message: Any) -> float:
+        raw = message.get_msgbuf()[10:14]
+        assert message.param_type == (6 if message.param_id in self.INTS else 9), "PX4 refuses another type"
+        return float(struct.unpack("<i" if message.param_type == 6 else "<f", raw)[0])
+
+    def _value_out(self, name: str) -> Any:
+        value = self.params[name]
+        if name not in self.INTS:
+            return dialect.MAVLink_param_value_message(name.encode(), value, 9, 1000, 40)
+        (bits,) = struct.unpack("<f", struct.pack("<i", int(value)))
+        return dialect.MAVLink_param_value_message(name.encode(), bits, 6, 1000, 40)

@@ -260,7 +260,7 @@ def test_S19_wrong_vehicle_and_other_autopilots_and_no_change_are_refused_at_onc
     refused(Rig(latch_s=0.5), Reason.HEARTBEAT_OLD)  # nobody latched yet
 
 
-def test_unknown_name_is_refused_in_ten_seconds_silent_or_not() -> None:
+def test_AT_8c_unknown_name_is_refused_in_ten_seconds_silent_or_not() -> None:
     rig = Rig()
     del rig.vehicle.params["COMPASS_LEARN"]
     begin_ns = rig.vehicle.now_ns
@@ -610,6 +610,46 @@ def test_AT_4b_killed_at_any_moment_the_way_back_works() -> None:
         assert rig.go(undoes=7).result is UploadResult.ALL_OLD
         assert rig.stored() == OLD
     assert mixed >= 10
+
+
+def test_AT_8b_a_float32_is_compared_as_one_and_its_neighbour_is_another_value() -> None:
+    """0.1 on disk, in JSON or as the wire's float is one value; one unit in the last place off is not (AT-8b)."""
+    rig = Rig()
+    rig.vehicle.params["COMPASS_OFS_X"] = rig.vehicle.applied["COMPASS_OFS_X"] = f32(0.1)
+    change = a_change(old=(0.1, *OLD[1:]), new=(60.1, *a_change().new[1:]))
+    assert rig.go(change).result is UploadResult.ALL_NEW
+    rig = Rig()
+    near = float(np.nextafter(np.float32(OLD[0]), np.float32(99.0)))
+    rig.vehicle.params["COMPASS_OFS_X"] = near
+    assert rig.go().reasons == (Reason.OFFSETS_CHANGED,)
+
+
+def test_S20_after_a_write_there_is_advice_before_take_off_and_after_none_there_is_none() -> None:
+    """Every end that wrote something says wait or reboot; none before the compass settled, none that invites."""
+    rig = Rig()
+    upload = rig.go()
+    done_ns = rig.vehicle.now_ns
+    assert done_ns - rig.vehicle.sets[-1][0] >= UploadSettings().settle_ns, "the end comes after the compass settled"
+    spoilt = Rig(applies=False).go()
+    cut = Rig()
+    cut.vehicle.on_set = lambda name: setattr(cut.vehicle, "loss", 1.0)
+    for ended in (upload, spoilt, cut.go()):
+        assert "reboot or wait half a minute before take-off" in ended.progress, ended.progress
+    assert "take-off" not in Rig(armed=True).go().progress
+
+
+def test_S20_no_end_of_a_write_comes_before_its_settle_time() -> None:
+    for seed in range(20):
+        rig = Rig(seed, noise_mg=0.1)
+        phases: list[tuple[int, str]] = []
+        upload = Upload(a_change(), rig.watch, journal=rig.journal)
+        rig.vehicle.at.append((0, lambda: None))
+        upload.start(rig.vehicle.now_ns)
+        while upload.result is None:
+            phases.append((rig.vehicle.now_ns, upload.phase.name))
+            rig.vehicle.run(upload, 0.02, rig.feed)
+        first_proof = next(t for t, phase in phases if phase == "PROOF")
+        assert first_proof - rig.vehicle.sets[-1][0] >= UploadSettings().settle_ns
 
 
 def test_settings_can_only_tighten_the_limit() -> None:

@@ -47,8 +47,12 @@ class Notes:
 class Rig:
     """Vehicle, presence, watch and journal, latched and ready."""
 
+    make: type[Vehicle] = Vehicle
+    names = NAMES
+    first = staticmethod(a_change)
+
     def __init__(self, seed: int = 0, latch_s: float = 4.0, **knobs: Any) -> None:
-        self.vehicle = Vehicle(seed)
+        self.vehicle = self.make(seed)
         for name, value in knobs.items():
             setattr(self.vehicle, name, value)
         self.presence = Presence()
@@ -63,14 +67,14 @@ class Rig:
         self.watch.on_message(message, route, now_ns)
 
     def go(self, change: Change | None = None, *, until_s: float = 150.0, **more: Any) -> Upload:
-        self.upload = upload = Upload(change or a_change(), self.watch, journal=self.journal, **more)
+        self.upload = upload = Upload(change or self.first(), self.watch, journal=self.journal, **more)
         upload.start(self.vehicle.now_ns)
         self.vehicle.run(upload, until_s, self.feed)
         assert upload.result is not None, f"it always ends, but is in {upload.phase}"
         return upload
 
     def stored(self) -> tuple[float, ...]:
-        return tuple(self.vehicle.params[name] for name in NAMES)
+        return tuple(self.vehicle.params[name] for name in self.names)
 
     def check_S1(self) -> None:
         """No PARAM_SET without a disarmed heartbeat at most 1.2 s old, nor after one that says armed."""
@@ -83,7 +87,7 @@ class Rig:
             last_ns, armed = beats[-1]
             assert not armed, f"{name} was written after a heartbeat that said armed"
             assert when - last_ns <= 1200 * MS, f"{name} was written {(when - last_ns) / S} s after a heartbeat"
-            assert name in NAMES, f"S5, S9: {name} was written"
+            assert name in self.names, f"S5, S9: {name} was written"
 
 
 def refused(rig: Rig, *why: Reason, **more: Any) -> None:
