@@ -46,7 +46,7 @@ from magmav.settings import Settings, Wire
 from magmav.store import Store
 
 HOUR = 3600
-IMU_HZ, ATTITUDE_HZ, SLOW_HZ = 5.0, 5.0, 1.0
+IMU_HZ, ATTITUDE_HZ, SLOW_HZ = 2.0, 2.0, 0.5  # a day is long; the companion asks for 20, 20 and 2 by itself
 _EARTH_MG = (210.0, 10.0, 427.0)
 _SAMPLE_S = 300.0
 _GROUND = (255, 190)
@@ -166,7 +166,8 @@ class Day:
     def _land(self) -> None:
         v = self.crew.vehicle
         v.armed, v.landed_state, self.flying_since_ns = False, 1, None
-        self.after(15.0, lambda: self.ground("PARAM_SET", param_id=b"MMAG_UPLOAD", param_value=1.0, param_type=9))
+        ask = {"param_id": b"MMAG_UPLOAD", "param_value": 1.0, "param_type": 9}
+        self.after(15.0, lambda: self.ground("PARAM_SET", v.route, **ask))
         self.after(70.0, lambda: self.log.results.update([f"{self.crew.session.companion.result:g}"]))
 
     def reboot(self) -> None:
@@ -200,12 +201,15 @@ class Day:
 
     # ------------------------------------------------------------ the ground station
 
-    def ground(self, name: str, **fields: Any) -> None:
-        """One message of the ground station to our component."""
+    def ground(self, name: str, over: str = "udp:14550", **fields: Any) -> None:
+        """One message of the ground station to our component; what starts a write has to come over the vehicle's route.
+
+        That is what a router, or a vehicle that forwards, makes of it (design, rule 11).
+        """
         crew = self.crew
         target = {} if name in ("HEARTBEAT",) else {"target_system": 1, "target_component": 191}
         frame = packed(name, target | fields, _GROUND)
-        crew.vehicle.receive(crew.take(Packet(crew.vehicle.now_ns, frame, "udp:14550")))
+        crew.vehicle.receive(crew.take(Packet(crew.vehicle.now_ns, frame, over)))
 
     def storm(self) -> None:
         """Twenty seconds of lists, reads and sets, as a ground station with a broken loop sends them."""

@@ -1,6 +1,6 @@
 """Mutated MAVLink into the whole service: nothing raises, nothing grows, nothing of the vehicle changes.
 
-    fuzz_wire.py [BYTES] [SEED]    default 10000000 bytes. Part of `make soak`.
+    fuzz_wire.py [BYTES] [SEED] [WORKERS]    default 10000000 bytes, 1 and every core. Part of `make soak`.
 
 The service (Session.on) sits between a scripted ArduPilot, on route udp:1, and somebody who sends rubbish. Five turns,
 each a fifth of the bytes:
@@ -26,7 +26,9 @@ import sys
 import time
 import traceback
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -37,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 from rich.table import Table
 from soak_rig import NAMES, Crew, S
 
@@ -239,29 +241,26 @@ class Fuzz:
         self._before = dict(v.params)
         self._begun_ns = v.now_ns
 
-    def step(self) -> int:
-        """20 ms of the vehicle, then a handful of rubbish. How many bytes that were."""
+    def step(self) -> None:
+        """20 ms of the vehicle, then a handful of rubbish."""
         crew, turn, dice = self.crew, self.turn, self.mutator.dice
         crew.run(0.02)
         self._ask()
-        size = 0
         # Half a minute with somebody who claims to be the vehicle, for which every upload is refused, and one without.
         self.mutator.claims = crew.vehicle.now_ns // (30 * S) % 2 == 0
         for _ in range(dice.choice((0, 0, 0, 0, 1, 2, 12))):
             data, route = self.mutator.next(turn.name)
             if not data:
                 continue
-            size += len(data)
+            turn.bytes_in += len(data)
             turn.frames += 1
             packet = Packet(crew.vehicle.now_ns, data, route)
             try:
                 crew.vehicle.receive([o for o in crew.take(packet) if o.route in ("", OWN_ROUTE)])
             except Exception:  # any exception is what we are looking for
                 turn.raised.append(f"{data.hex()} over {route}\n{traceback.format_exc()}")
-        turn.bytes_in += size
         turn.bytes_out = crew.bytes_out
         self._judge()
-        return size
 
     def _ask(self) -> None:
         """Uploads are asked for where the turn has them."""
@@ -305,7 +304,7 @@ class Fuzz:
         turn.simulated_s = (crew.vehicle.now_ns - self._begun_ns) / S
 
 
-def run(name: str, size: int, seed: int, tick: Any = lambda size: None) -> Turn:
+def run(name: str, size: int, seed: int) -> Turn:
     """One turn of so many bytes."""
     with TemporaryDirectory() as folder, Store(Path(folder) / "fuzz.sqlite") as store:
         fuzz = Fuzz(name, seed, store)
@@ -313,7 +312,7 @@ def run(name: str, size: int, seed: int, tick: Any = lambda size: None) -> Turn:
         begun, turn = time.process_time(), fuzz.turn
         mark = size / 10
         while turn.bytes_in < size:
-            tick(fuzz.step())
+            fuzz.step()
             if turn.bytes_in >= mark * (len(turn.blocks) + 1):
                 gc.collect()
                 turn.blocks.append(sys.getallocatedblocks())
@@ -349,12 +348,12 @@ def table(turns: list[Turn]) -> Table:
 
 def main(argv: list[str]) -> int:
     """Run every turn, print the table; 1 when something happened that must not."""
-    size, seed = (int(v) for v in (*argv, *("10000000", "1")[len(argv) :]))
-    turns = []
-    with Progress(console=Console(stderr=True)) as progress:
-        for name in TURNS:
-            task = progress.add_task(name, total=size / len(TURNS))
-            turns.append(run(name, size // len(TURNS), seed, lambda n, task=task: progress.advance(task, n)))
+    size, seed, workers = (int(v) for v in (*argv, *("10000000", "1", f"{os.cpu_count() or 1}")[len(argv) :]))
+    # A process for each turn, so that the memory of each is its own.
+    with ProcessPoolExecutor(workers, get_context("spawn"), max_tasks_per_child=1) as pool:
+        tasks = [pool.submit(run, name, size // len(TURNS), seed) for name in TURNS]
+        done = track(as_completed(tasks), "turns", len(tasks), console=Console(stderr=True))
+        turns = sorted((task.result() for task in done), key=lambda t: TURNS.index(t.name))
     out = Console(width=200)
     out.print(table(turns))
     for turn in turns:

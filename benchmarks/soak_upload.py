@@ -16,8 +16,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import Pool
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
@@ -295,13 +296,9 @@ def arming_table(timings: Sequence[Timing]) -> Table:
 
 def _through(work: Callable[[_A], _T], tasks: Sequence[_A], what: str, workers: int) -> list[_T]:
     out: list[_T] = []
-    with ProcessPoolExecutor(workers) as pool:
-        done = pool.map(work, tasks, chunksize=4)
-        try:
-            for one in track(done, what, len(tasks), console=Console(stderr=True)):
-                out.append(one)
-        except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
+    with Pool(workers) as pool, suppress(KeyboardInterrupt):
+        for one in track(pool.imap(work, tasks), what, len(tasks), console=Console(stderr=True)):
+            out.append(one)
     return out
 
 
