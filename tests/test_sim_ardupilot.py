@@ -166,6 +166,16 @@ def test_newer_releases_answer_with_param_error():
     assert errors(lambda: ground.set("COMPASS_OFS_X", 1.0)) == []
 
 
+def test_newer_releases_send_highres_imu_a_million_times_too_large():
+    ground = Ground(simulation(COMPASS + '[autopilot]\nrelease = "newer"\n'))
+    ground.stream(27, 20)
+    assert ground.command(511, 105, 50_000) == ACCEPTED
+    heard = {m.get_type(): m for m in ground.run(0.5)}
+    gauss = mag(heard["HIGHRES_IMU"]) / 1e6
+    np.testing.assert_array_equal(np.trunc(gauss * 1000), mag(heard["RAW_IMU"]))
+    assert heard["HIGHRES_IMU"].zacc == pytest.approx(-9.81, abs=0.2)
+
+
 def test_command_int_does_what_command_long_does():
     ground = Ground(simulation())
     for command, params, result in ((511, (27, 50_000), ACCEPTED), (242, (2, 1), UNSUPPORTED), (400, (1, 0), ACCEPTED)):

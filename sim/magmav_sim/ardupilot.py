@@ -6,14 +6,15 @@ moves the parameter blocks so that block n is compass n again.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav_sim.autopilot import Autopilot
 from magmav_sim.correction import Correction, stored_correction
 from magmav_sim.faults import Vector
-from magmav_sim.messages import BUILDERS
+from magmav_sim.messages import BUILDERS, highres_of_a_bad_build
 from magmav_sim.parameters import Parameters, compass_name
 from magmav_sim.scenario import Scenario
 from magmav_sim.world import World
@@ -37,7 +38,7 @@ class ArduPilot(Autopilot):
     """committed : the device id that is stored with each compass's calibration; not to be seen from outside."""
 
     vendor = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
-    builders = BUILDERS
+    builders: ClassVar[Mapping[str, Callable[[Any], Any]]] = BUILDERS
     groups = _GROUPS
 
     def __init__(self, scenario: Scenario, world: World, seed: int) -> None:
@@ -150,6 +151,12 @@ class ArduPilot(Autopilot):
         self.outbox.append(
             dialect.MAVLink_param_value_message(name.encode(), table[name], table.kind(name), len(table), index)
         )
+
+
+class LaterArduPilot(ArduPilot):
+    """A release that can send HIGHRES_IMU too, and has its units wrong."""
+
+    builders: ClassVar[Mapping[str, Callable[[Any], Any]]] = {**BUILDERS, "HIGHRES_IMU": highres_of_a_bad_build}
 
 
 def _naming(stem: str, axis: str) -> Any:

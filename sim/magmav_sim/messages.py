@@ -132,6 +132,16 @@ def _raw_imu(a: Autopilot) -> Any:
     return dialect.MAVLink_raw_imu_message(a.boot_ns // 1000, *_inertial(a, 1), 0, 3500)
 
 
+def highres_of_a_bad_build(a: Autopilot) -> Any:
+    """HIGHRES_IMU as later ArduPilots first had it: mG times 1000 in the name of gauss (autopilots.md 1.2)."""
+    s, bias = a.state, a.gyro_bias_rads
+    return dialect.MAVLink_highres_imu_message(
+        a.boot_ns // 1000, s.force_x_mss + a.jitter(), s.force_y_mss + a.jitter(), s.force_z_mss + a.jitter(),
+        s.p_rads + bias[0], s.q_rads + bias[1], s.r_rads + bias[2], *(v * 1e3 for v in a.published_mg[0]),
+        1013.25, 0.0, a.home.alt_m + s.height_m, 35.0, 0b1111111111111, 0,
+    )  # fmt: skip
+
+
 def _version(a: Autopilot) -> Any:
     capabilities = 0x0001 | 0x0002 | 0x2000  # mission float, parameters as C casts, MAVLink 2
     # send_autopilot_version leaves uid at zero and says who the board is in uid2.

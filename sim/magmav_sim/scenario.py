@@ -69,8 +69,9 @@ class Anomaly(_Table, frozen=True, kw_only=True):
 class AutopilotSpec(_Table, frozen=True, kw_only=True):
     """How the autopilot behaves. yaw "compass" follows its own corrected compass 1, "truth" does not.
 
-    release : "older" is ArduPilot 4.5, silent about what it does not take, and a PX4 that ignores a change of offsets
-    up to 10 mG and applies changes only disarmed; "newer" answers with PARAM_ERROR, ignores up to 5 mG, applies always.
+    release : of ArduPilot, "older" is 4.5, silent about what it does not take; "newer" answers with PARAM_ERROR, has a
+    HIGHRES_IMU in wrong units. Of PX4, "older" ignores a change of offsets up to 10 mG and applies changes only
+    disarmed, "newer" ignores up to 5 mG and applies always.
     naming : ArduPilot's COMPASS_OFS2_X ("old") or COMPASS2_OFS_X ("new").
     uid : what AUTOPILOT_VERSION says of the board; from the seed where it is not given.
     ekf_tau_s : how fast PX4's filter learns what its calibration left over, in the air.

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.mavlink.codec import Codec
 from magmav_sim.airframe import FRAME_S
-from magmav_sim.ardupilot import ArduPilot
+from magmav_sim.ardupilot import ArduPilot, LaterArduPilot
 from magmav_sim.autopilot import Autopilot
 from magmav_sim.faults import Reboot, SecondRoute, Signed
 from magmav_sim.mission import Mission
@@ -24,7 +24,12 @@ from magmav_sim.streams import Streams
 from magmav_sim.world import World
 
 _FRAME_NS = round(FRAME_S * 1e9)
-_KINDS: dict[str, type[Autopilot]] = {"ardupilot": ArduPilot, "px4": Px4}
+_KINDS: dict[tuple[str, str], type[Autopilot]] = {
+    ("ardupilot", "older"): ArduPilot,
+    ("ardupilot", "newer"): LaterArduPilot,
+    ("px4", "older"): Px4,
+    ("px4", "newer"): Px4,
+}
 _MOST_UNHEARD = 1000  # frames of the second route, where nobody takes them
 
 
@@ -56,7 +61,9 @@ class Simulation:
         self.seed = scenario.seed if seed is None else seed
         self.world = World(scenario, self.seed)
         try:
-            self.autopilot = _KINDS[scenario.autopilot.kind](scenario, self.world, self.seed)
+            self.autopilot = _KINDS[scenario.autopilot.kind, scenario.autopilot.release](
+                scenario, self.world, self.seed
+            )
             self._streams = Streams(self.autopilot, scenario.autopilot.rates_hz)
         except ValueError as error:
             raise ScenarioError(f"scenario {scenario.name}: autopilot: {error}") from error
