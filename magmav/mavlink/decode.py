@@ -41,6 +41,7 @@ _EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a bo
 # No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
 _MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
 _MOST_GAUSS = 10.0  # a length beyond it, twenty times the Earth's field, is in another unit
+_END_OF_SCALE = 32767  # of 16 bits: 33 gauss, or another unit
 _COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
 
 
@@ -118,6 +119,8 @@ class Decoder:
             out.append(InertialReading(system, kind, boot_ns, force, rate))
         if (m.xmag, m.ymag, m.zmag) == (0, 0, 0):
             self.counts[f"{kind}: no compass (all zero)"] += 1
+        elif max(abs(m.xmag), abs(m.ymag), abs(m.zmag)) >= _END_OF_SCALE:
+            self.counts[f"{kind}: field at the end of its scale"] += 1
         else:
             field = vec3((m.xmag, m.ymag, m.zmag), "field")
             # The same message, but PX4 sends the sensor's own field in the sensor's own axes (autopilots.md 4.1).
