@@ -200,11 +200,11 @@ class Writer:
         if job.result is UploadResult.REFUSED:
             code = -float(job.reasons[0].number) if job.reasons else -1.0
         self.result = code
-        worst = job.result in (UploadResult.PENDING_RESTORE, UploadResult.WRITTEN_UNPROVEN)
+        severity = {UploadResult.PENDING_RESTORE: _CRITICAL, UploadResult.WRITTEN_UNPROVEN: _WARNING}
         words = "; ".join(r.text for r in job.reasons)
         _log.info("compass %d: %s", job.change.compass, job.progress)
         text = f"MMAG c{job.change.compass} {job.result.name}" + (f": {words}" if words else "")
-        self._announcer.say(_CRITICAL if worst else _INFO, text, now_ns)
+        self._announcer.say(severity.get(job.result, _INFO), text, now_ns)
         code_text = code_needed(job.change, self._settings().upload.confirm_above_mg)
         if Reason.CONFIRM_CHANGE in job.reasons and code_text is not None:
             step = largest_step_mg(job.change)

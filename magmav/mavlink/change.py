@@ -63,21 +63,23 @@ def code_needed(change: Change, above_mg: float = CONFIRM_ABOVE_MG) -> int | Non
     return confirmation_code(change) if largest_step_mg(change) > above_mg else None
 
 
-def dry_run(change: Change, above_mg: float = CONFIRM_ABOVE_MG) -> list[str]:
-    """Every message an upload of this change would send, in order, a line each; the code last, if wanted.
+def dry_run(change: Change, above_mg: float = CONFIRM_ABOVE_MG, *, undo: bool = False) -> list[str]:
+    """Every message the transaction would send, in order, a line each; the code last, if wanted.
 
     Requests are repeated when unanswered. Where the proof fails, the old values are written back the same
-    way.
+    way. undo : the way back, from a vehicle that holds the new values.
     """
     adapter = adapter_for(change)
     change = adapter.checked(change)
-    pairs = list(zip(change.names, change.old, change.new, strict=True))
+    start, target = (change.new, change.old) if undo else (change.old, change.new)
     lines = [f"PARAM_REQUEST_READ {name}" for name in adapter.reads(change)]
-    lines += [f"PARAM_SET {name} {new!r} (now {old!r})" for name, old, new in pairs if not same(old, new)]
+    for name, now, then in zip(change.names, start, target, strict=True):
+        if not same(now, then):
+            lines.append(f"PARAM_SET {name} {then!r} (now {now!r})")
     lines += [f"PARAM_REQUEST_READ {name}" for name in change.names]
-    if adapter.proof_streams(change.compass):
+    if adapter.proof_streams(change.compass) and not undo:
         lines.append("COMMAND_LONG MAV_CMD_RUN_PREARM_CHECKS")
-    code = code_needed(change, above_mg)
+    code = None if undo else code_needed(change, above_mg)
     return lines if code is None else [*lines, f"a change above {above_mg:g} mG: confirm with code {code}"]
 
 
