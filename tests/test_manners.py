@@ -386,5 +386,7 @@ def test_S14_whatever_was_wanted_in_turn_the_vehicle_ends_with_the_last_and_gets
         assert {i for i, us in holds.items() if us} == {IDS[name] for name in wanted}
         assert all(holds[IDS[name]] == round(1e6 / hz) for name, hz in wanted.items())
         assert set(machine.rates) == set(wanted)
-    obey(machine.restore())
+    back = machine.restore()
+    assert {round(o.message.param1) for o in back} == {i for i, us in holds.items() if us}, "and no other"
+    obey(back)
     assert set(holds.values()) <= {0.0} or (not turns and holds == {})

@@ -18,7 +18,6 @@ from magmav.mavlink.ftp import FileServer
 
 _COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 _PING_REPEATS = 3
-_MOST_ASKERS = 64
 _PINGS_PER_S = 5.0
 _MOST_PINGERS = 64
 _MOST_DEBT_S = 2.0  # a command is answered at once unless somebody floods us
@@ -80,8 +79,6 @@ class Manners:
         what = message.time_usec, message.seq
         last, times = self._pinged.pop(sender, (what, 0))
         times = times + 1 if last == what else 1
-        if sender not in self._pinged and len(self._pinged) >= _MOST_ASKERS:
-            del self._pinged[next(iter(self._pinged))]
         self._pinged[sender] = what, times
         if len(self._pinged) > _MOST_PINGERS:
             del self._pinged[next(iter(self._pinged))]  # who has been silent longest
