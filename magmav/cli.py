@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--plot", type=Path, metavar="PNG", help="where to draw the picture")
 
     run = add("run", f"the service on a live link ({_LINKS})", place=True, store=True, bench=True)
-    _link(run)
+    _link(run, several=True)
     run.add_argument("--record", type=Path, metavar="TLOG", help="record the link, both ways")
     run.add_argument("--records", type=Path, metavar="FILE", help="every Record, .jsonl or .csv")
     run.add_argument("--for", dest="for_s", type=float, metavar="S", help="stop after so many seconds")
@@ -114,9 +114,15 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _link(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("link", metavar="LINK", help=_LINKS)
-    sub.add_argument("--system", type=int, metavar="ID", help="the vehicle, where several are heard")
+def _link(sub: argparse.ArgumentParser, several: bool = False) -> None:
+    sub.add_argument("link", metavar="LINK", help=_LINKS, nargs="+" if several else None)
+    which = "serve this vehicle only" if several else "the vehicle, where several are heard"
+    sub.add_argument("--system", type=int, metavar="ID", help=which)
+    key = "sign (MAVLink 2) and believe only what is signed: 32 bytes, hex, base64, or passphrase:WORDS"
+    sub.add_argument("--key-file", type=Path, metavar="FILE", help=key)
+    # Another one for a single write than for the service that may run beside it: each stream's timestamps only grow.
+    number = 191 if several else 190
+    sub.add_argument("--link-id", type=int, default=number, metavar="N", help=f"of what we sign (default {number})")
 
 
 def _write_options(sub: argparse.ArgumentParser) -> None:
@@ -153,6 +159,7 @@ def _guarded(options: argparse.Namespace) -> int:
     from magmav.demo import DemoError
     from magmav.live import NoVehicle
     from magmav.logs import LogError
+    from magmav.mavlink.signing import SigningError
     from magmav.recording import NothingToLearnFrom
     from magmav.reference import TruthError
     from magmav.saved_result import SavedResultError
@@ -163,7 +170,9 @@ def _guarded(options: argparse.Namespace) -> int:
         result: Any = COMMANDS[options.command](options)
     except (SettingsError, ValueError) as error:
         return fail(USAGE, str(error), options.json)
-    except (LogError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError) as error:
+    except (
+        LogError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError, SigningError,
+    ) as error:  # fmt: skip
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
         return fail(INPUT if options.command in ("replay", "compare") else PORT, str(error), options.json)

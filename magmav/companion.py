@@ -9,22 +9,29 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
+from magmav import __version__
+from magmav.choices import Choices, beside
 from magmav.coaching import Coaching
 from magmav.core.types import Change, Reason, Record, State, Verdict
+from magmav.hearing import same_end
 from magmav.mavlink.announce import Announcer
-from magmav.mavlink.autopilot.ardupilot import wanted_names
+from magmav.mavlink.autopilot.adapter import ADAPTERS, adapter_of
 from magmav.mavlink.budget import Budget
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.fetch import ParamFetch
 from magmav.mavlink.intervals import Intervals
+from magmav.mavlink.manners import Manners
+from magmav.mavlink.metadata import files
 from magmav.mavlink.params import ParamServer
 from magmav.mavlink.presence import Presence
+from magmav.mavlink.signing import Seal
 from magmav.mavlink.upload import Upload
 from magmav.mavlink.watch import Watch
-from magmav.own_params import COMPASSES, entries
+from magmav.own_params import COMPASSES, entries, meant
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings, SettingsError, with_value
 from magmav.store import SavedEstimate, Store, StoreError
@@ -34,16 +41,17 @@ from magmav.writing import Writer
 _log = logging.getLogger("magmav")
 _SAVE_EVERY_NS = 10_000_000_000
 _WARNING, _INFO = 4, 6
+_ARDUPILOT = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 _SLOW = (
     "GLOBAL_POSITION_INT", "GPS_RAW_INT", "BATTERY_STATUS", "VFR_HUD", "SYSTEM_TIME", "EXTENDED_SYS_STATE",
 )  # fmt: skip
 
 
-def wanted_rates(settings: Settings) -> dict[str, float]:
-    """The messages we live on, and how often we ask for them."""
-    w = settings.wire
-    rates = dict.fromkeys(("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"), w.imu_hz)
-    rates |= {"ATTITUDE": w.attitude_hz} | dict.fromkeys(_SLOW, w.slow_hz)
+def wanted_rates(settings: Settings, kind: int = _ARDUPILOT) -> dict[str, float]:
+    """The messages we live on, as this MAV_AUTOPILOT calls them, and how often we ask for them."""
+    w, adapter = settings.wire, adapter_of(kind) or ADAPTERS[_ARDUPILOT]
+    rates = dict.fromkeys(adapter.compass_streams, w.imu_hz)
+    rates |= {"ATTITUDE": w.attitude_hz} | dict.fromkeys((*_SLOW, *adapter.slow_streams), w.slow_hz)
     return {name: hz for name, hz in rates.items() if hz > 0.0}
 
 
@@ -51,6 +59,7 @@ class MagCompanion:
     """Serves one vehicle. ``writer`` makes the writes.
 
     serves : False for one write of the caller's and nothing else, no trigger and no pending restore.
+    keyed : what we send is signed.  budget, choices : of its own unless given.
     """
 
     def __init__(
@@ -62,8 +71,14 @@ class MagCompanion:
         *,
         ask: bool = True,
         serves: bool = True,
+        keyed: bool = False,
+        budget: Budget | None = None,
+        choices: Path | None = None,
     ) -> None:
-        self.settings = settings
+        self._choices = Choices(choices or beside(store.path), settings)
+        self.settings = settings = self._choices.settings()
+        pipeline.apply(settings, settings.vehicle.system or None)
+        self._asks_for: frozenset[str] | None = None if ask else frozenset()
         self._pipeline = pipeline
         self._store = store
         self._unix_offset_ns = unix_offset_ns
@@ -73,12 +88,17 @@ class MagCompanion:
         self._saved_ns: dict[int, int] = {}
         self._said_ambiguous = False
         v = settings.vehicle
-        self.presence = Presence(v.component, v.system or None)
+        own = entries(self, lambda: self._now_ns)
+        self.budget = budget or Budget(settings.wire.budget_bps, signed=keyed)
+        self._seal = Seal(keyed)
+        self._said_sealed = False
+        self._source: tuple[int, str] | None = None
+        self.presence = Presence(v.component, v.system or None, Manners(self.budget, files(own, __version__)))
         self._watch = Watch(self.presence)
-        self._intervals = Intervals(wanted_rates(settings) if ask else {}, self.presence)
-        self._fetch = ParamFetch(wanted_names(COMPASSES), self.presence)
-        self._budget = Budget(settings.wire.budget_bps)
-        self.announcer = Announcer(self._budget, settings.wire.heading_hz)
+        self.kind = _ARDUPILOT  # MAV_AUTOPILOT of the vehicle, once it is known
+        self._intervals = Intervals(self._rates(), self.presence)
+        self._fetch = ParamFetch(ADAPTERS[self.kind].names(COMPASSES), self.presence)
+        self.announcer = Announcer(self.budget, settings.wire.heading_hz)
         self._coaching = Coaching(pipeline.vehicles, lambda text, now: self.announcer.say(_INFO, f"MMAG {text}", now))
         self.writer = Writer(
             pipeline,
@@ -90,13 +110,16 @@ class MagCompanion:
             unix_offset_ns=unix_offset_ns,
             serves=serves,
         )
-        self._server = ParamServer(entries(self, lambda: self._now_ns), self.presence, self._budget)
+        self._server = ParamServer(own, self.presence, self.budget, denied=self._denied)
 
     def ask_for(self, names: Iterable[str]) -> None:
         """Ask the vehicle for these messages only; whoever else asked for the others keeps them."""
-        chosen = set(names)
-        rates = {n: hz for n, hz in wanted_rates(self.settings).items() if n in chosen}
-        self._intervals = Intervals(rates, self.presence)
+        self._asks_for = frozenset(names)
+        self._intervals = Intervals(self._rates(), self.presence)
+
+    def _rates(self) -> dict[str, float]:
+        wanted = wanted_rates(self.settings, self.kind)
+        return {n: hz for n, hz in wanted.items() if self._asks_for is None or n in self._asks_for}
 
     # ------------------------------------------------------------ what the service calls
 
@@ -112,12 +135,51 @@ class MagCompanion:
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
         """Every machine hears everything."""
         self._now_ns = now_ns
+        self._seal.on_message(message, route)
         out = self.presence.on_message(message, route, now_ns)
         self._watch.on_message(message, route, now_ns)
-        for machine in (self._intervals, self._fetch):
-            out += machine.on_message(message, route, now_ns)
+        self._begin_anew()
+        if not self.sealed:
+            for machine in (self._intervals, self._fetch):
+                out += machine.on_message(message, route, now_ns)
+            if message.get_type() == "PARAM_VALUE":
+                self._suit()
         out += self.writer.on_message(message, route, now_ns)
         return self._counted(out, now_ns) + self._server.on_message(message, route, now_ns)
+
+    def believes(self, message: Message, route: str) -> bool:
+        """Whether what it says of a vehicle counts (design, rule 11)."""
+        return self.presence.believes(message, route)
+
+    @property
+    def sealed(self) -> bool:
+        """LINK_SIGNED_READ_ONLY: the vehicle signs and we hold no key, so it would hear nothing; nothing is asked."""
+        autopilot = self.presence.autopilot
+        return autopilot is not None and self._seal.shuts_out(autopilot.pin)
+
+    def _begin_anew(self) -> None:
+        """Another component, or another end of the link, speaks for the vehicle now: what was learnt rests on one."""
+        autopilot = self.presence.autopilot
+        source = None if autopilot is None else (autopilot.component, same_end(autopilot.route))
+        if source == self._source:
+            return
+        if self._source is not None:
+            _log.warning("system %d is now heard over %s: learning begins anew", self.presence.system, source)
+            for kept in (self._records, self._states, self._saved_ns):
+                kept.clear()
+            self._fetch.restart()
+        self._source = source
+
+    def _suit(self) -> None:
+        """Ask for the parameters and messages this autopilot has, by the names it answers to."""
+        autopilot = self.presence.autopilot
+        if autopilot is None:
+            return
+        adapter = adapter_of(autopilot.kind) or ADAPTERS[_ARDUPILOT]
+        self._fetch.want(adapter.names(COMPASSES, self._fetch.heard))
+        if autopilot.kind != self.kind:
+            self.kind = autopilot.kind
+            self._intervals.want(self._rates())
 
     def on_record(self, record: Record, now_ns: int) -> None:
         """Publish what is new about a compass of the served vehicle."""
@@ -142,24 +204,38 @@ class MagCompanion:
         if self.presence.ambiguous and not self._said_ambiguous:
             self._said_ambiguous = True
             _log.warning("several vehicles %s; choose one with --system ID", self.presence.ambiguous)
-        out = self.writer.poll(now_ns)
-        for machine in (self.presence, self._intervals, self._fetch):
-            out += machine.poll(now_ns)
+        self._choices.poll(now_ns)
+        self._tell_sealed(now_ns)
+        out = [] if self.sealed and self.job is None else self.writer.poll(now_ns)
+        out += self.presence.poll(now_ns)
+        self._begin_anew()
+        if not self.sealed:
+            if self.presence.autopilot is not None and self.presence.autopilot.kind != self.kind:
+                self._suit()
+            for machine in (self._intervals, self._fetch):
+                out += machine.poll(now_ns)
         return self._counted(out, now_ns) + self._server.poll(now_ns) + self.announcer.poll(now_ns)
+
+    def _tell_sealed(self, now_ns: int) -> None:
+        if self.sealed and not self._said_sealed:
+            why = Reason.LINK_SIGNED_READ_ONLY
+            _log.warning("system %d: %s: %s; give --key-file", self.presence.system, why.name, why.text)
+            self.announcer.say(_WARNING, f"MMAG {why.name}", now_ns)
+        self._said_sealed = self.sealed
 
     def _counted(self, out: list[Outgoing], now_ns: int) -> list[Outgoing]:
         """What must go out at once is paid back by what can wait: the whole stays in the budget (AT-9c)."""
-        for message, _ in out:
-            if message.get_type() != "PING":  # as often as somebody asks; must not silence all else
-                self._budget.force(message, now_ns)
+        for item in out:
+            self.budget.force(item.message, now_ns)
         return out
 
     def leave(self, now_ns: int) -> list[Outgoing]:
-        """Keep what is known, give the message intervals back."""
+        """Keep what is known and chosen, give the message intervals back."""
+        self._choices.keep()
         for compass, record in self._records.items():
             if record.verdict.state is State.READY:
                 self._save(compass, now_ns)
-        return self._intervals.restore()
+        return [] if self.sealed else self._intervals.restore()
 
     # ------------------------------------------------------------ what the parameters show and move
 
@@ -167,19 +243,29 @@ class MagCompanion:
         """Latest Record of a compass, None when it is over two seconds old."""
         return self.writer.fresh(compass, now_ns)
 
-    def choose(self, section: str, key: str, value: float) -> bool:
-        """Change one setting in flight; False when it is out of its limits."""
-        was = getattr(getattr(self.settings, section), key)
-        wanted: object = value
-        if isinstance(was, bool):
-            wanted = bool(value) if value in (0.0, 1.0) else value
+    def choose(self, section: str, key: str, value: float, *, keep: bool = True) -> bool:
+        """Change one setting in flight; False when it is out of its limits.
+
+        value : as on the wire, see own_params.meant.  keep : after a restart too.
+        """
+        wanted = meant(section, key, value)
         try:
             self.settings = with_value(self.settings, section, key, wanted)
         except SettingsError:
             return False
-        self._pipeline.apply(self.settings)
+        if keep:
+            self._choices.chose(section, key, wanted, self._now_ns)
+        if self._choices.problem:
+            self.announcer.say(_WARNING, "MMAG choice not kept: see the log", self._now_ns)
+        self._pipeline.apply(self.settings, self.presence.system)
+        self.budget.rate(self.settings.wire.budget_bps)
         self.announcer.rate(self.settings.wire.heading_hz)
+        self._intervals.want(self._rates())
         return True
+
+    def _denied(self, name: str, now_ns: int) -> None:
+        """Rule 11: what moves a write comes over the vehicle's own route."""
+        self.announcer.say(_WARNING, f"MMAG refused {name}: another route", now_ns)
 
     # ------------------------------------------------------------ writing
 
@@ -218,11 +304,17 @@ class MagCompanion:
 
     def request_upload(self, compass: int, now_ns: int) -> None:
         """Upload what is known now, if the gate says it may be."""
-        self.writer.request_upload(compass, now_ns)
+        if self.sealed:
+            self.writer.refuse(Reason.LINK_SIGNED_READ_ONLY, now_ns)
+        else:
+            self.writer.request_upload(compass, now_ns)
 
     def request_restore(self, compass: int, now_ns: int) -> None:
         """Bring back the values from before the last upload of this compass."""
-        self.writer.request_restore(compass, now_ns)
+        if self.sealed:
+            self.writer.refuse(Reason.LINK_SIGNED_READ_ONLY, now_ns)
+        else:
+            self.writer.request_restore(compass, now_ns)
 
     def flown(self) -> Flown | None:
         """The served vehicle in the pipeline."""
@@ -246,7 +338,7 @@ class MagCompanion:
         x, y, z = (float(v) for v in record.offsets_mg)
         sx, sy, sz = (float(v) for v in record.sigma_mg)
         unix_ns = now_ns + self._unix_offset_ns
-        saved = SavedEstimate(unix_ns, str(change.system), change, record.verdict, (x, y, z), (sx, sy, sz))
+        saved = SavedEstimate(unix_ns, self.writer.vehicle, change, record.verdict, (x, y, z), (sx, sy, sz))
         try:
             self._store.save_estimate(saved)
         except StoreError as error:

@@ -10,9 +10,12 @@ from typing import Any
 
 from magmav.companion import MagCompanion, wanted_rates
 from magmav.core.types import Change, FieldModel, Reason, UploadResult
+from magmav.dry import every_message
 from magmav.link import Link
 from magmav.mavlink.autopilot.ardupilot import offset_names
-from magmav.mavlink.change import code_needed, dry_run, largest_step_mg
+from magmav.mavlink.change import code_needed, largest_step_mg
+from magmav.mavlink.signing import Signing
+from magmav.own_params import COMPASSES
 from magmav.pipeline import Pipeline
 from magmav.service import Service, Watcher
 from magmav.settings import Settings
@@ -45,6 +48,7 @@ class Session:
         watchers: Sequence[Watcher] = (),
         *,
         ask: bool = True,
+        signer: Signing | None = None,
     ) -> Session:
         """Build pipeline, companion and service for a link.
 
@@ -52,8 +56,9 @@ class Session:
         one write and nothing else.
         """
         pipeline = Pipeline(settings, model, link.unix_offset_ns)
-        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns, ask=ask, serves=ask)
-        return cls(Service(link, pipeline, companion, watchers), companion, pipeline)
+        keyed = signer is not None
+        companion = MagCompanion(settings, pipeline, store, link.unix_offset_ns, ask=ask, serves=ask, keyed=keyed)
+        return cls(Service(link, pipeline, companion, watchers, signer), companion, pipeline)
 
 
 def transact(
@@ -75,6 +80,7 @@ def transact(
     companion = session.companion
     begun_ns: int | None = None
     shown, asked = "", False
+    rates: list[str] = []
     before: Counter[str] | None = None
     chosen: Change | Write | Reason | None = None
     packets = link.packets()
@@ -87,12 +93,16 @@ def transact(
             elif not asked and before is not None and packet.t_ns - begun_ns > _LISTEN_NS:
                 # Another program may have set the rates; only what does not come anyway is asked for, and returned.
                 asked, heard = True, session.service.heard - before
-                companion.ask_for([n for n in wanted_rates(companion.settings) if not heard[n]])
+                rates = [n for n in wanted_rates(companion.settings, companion.kind) if not heard[n]]
+                companion.ask_for(rates)
             if stop():
                 break
             if companion.ended is not None:
                 return outcome(companion.ended.change, companion.ended.result, companion.ended.reasons, confirm)
-            if chosen is None:
+            if companion.sealed and companion.job is None:
+                return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_SIGNED_READ_ONLY,))}
+            ready = companion.writer.identified or companion.presence.autopilot is None
+            if chosen is None and ready and (asked or not dry):
                 device = _device(session, compass)
                 if device:
                     chosen = pick(device)
@@ -100,7 +110,7 @@ def transact(
                     if isinstance(change, Reason):
                         return {"result": "REFUSED", "compass": compass, "reasons": _reasons((change,))}
                     if dry:
-                        return _shown(change)
+                        return _shown(session, change, rates, undo=isinstance(chosen, Write))
                     undoes = chosen.id if isinstance(chosen, Write) else None
                     companion.start(change, confirm, packet.t_ns, undoes)
                 elif packet.t_ns - begun_ns > wait_s * _SECOND:
@@ -109,9 +119,8 @@ def transact(
                 shown = companion.job.progress
                 progress(shown)
     finally:
-        for message, route in companion.leave(packet.t_ns if begun_ns is not None else 0):
-            with suppress(OSError):
-                link.send(session.service.hearing.codec.encode(message, *companion.identity()), route)
+        with suppress(OSError):
+            session.service.leave()
     return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_LOST,))}
 
 
@@ -128,6 +137,9 @@ def _nobody(session: Session, compass: int, link: Link) -> Result:
     if presence.ambiguous:
         raise NoVehicle(f"{link.name}: several vehicles {presence.ambiguous}; choose one with --system")
     if presence.autopilot is None:
+        refused = session.service.hearing.codec.counts["not believed"]
+        if refused:
+            raise NoVehicle(f"{link.name}: {refused} messages came, none signed with this key; check --key-file")
         raise NoVehicle(f"{link.name}: no autopilot heard; is the vehicle on, and does it send to this link?")
     names = ", ".join(offset_names(compass))
     return {
@@ -138,8 +150,12 @@ def _nobody(session: Session, compass: int, link: Link) -> Result:
     }
 
 
-def _shown(change: Change) -> Result:
-    return outcome(change, None, (), None) | {"dry_run": True, "messages": dry_run(change)}
+def _shown(session: Session, change: Change, rates: Sequence[str], *, undo: bool) -> Result:
+    flown = session.companion.flown()
+    held = [] if flown is None else [name for c in COMPASSES for name in flown.calibrations.stored(c)]
+    above_mg = session.companion.settings.upload.confirm_above_mg
+    lines = every_message(change, rates, held, above_mg, undo=undo)
+    return outcome(change, None, (), None) | {"dry_run": True, "messages": lines}
 
 
 def outcome(change: Change, result: UploadResult | None, reasons: Sequence[Reason], confirm: int | None) -> Result:
@@ -176,6 +192,8 @@ def history_entry(row: Write) -> Result:
         "result": None if result is None else result.name,
         "reasons": _reasons(row.reasons),
         "undone": row.undone,
+        "vehicle": row.vehicle,
+        "kept": None if row.kept is None else row.kept.name,
         "old": dict(zip(row.change.names, row.change.old, strict=True)),
         "new": dict(zip(row.change.names, row.change.new, strict=True)),
     }

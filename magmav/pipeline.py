@@ -27,19 +27,29 @@ class Pipeline:
         self._model = model
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
+        self._own: dict[int, Settings] = {}
         # Their libraries take seconds to load: now, not at the first sample.
         ESTIMATORS[settings.learn.estimator]()
         Publisher(settings.heading.smooth, settings.heading.lag)
 
-    def apply(self, settings: Settings) -> None:
-        """Settings changed in flight: what is learnt stays."""
-        self.settings = settings
+    def apply(self, settings: Settings, system: int | None = None) -> None:
+        """Settings changed in flight, of one vehicle or of all: what is learnt stays."""
+        if system is None:
+            self.settings, self._own = settings, {}
+        else:
+            self._own[system] = settings
         for vehicle in self.vehicles.values():
-            vehicle.apply(settings)
+            if system in (None, vehicle.system):
+                vehicle.apply(settings)
+
+    def forget(self, system: int) -> None:
+        """What was learnt of this vehicle no longer counts: it is gone, or was heard from somewhere else."""
+        self.vehicles.pop(system, None)
 
     def step(self, reading: Reading, t_ns: int) -> Record | None:
         """Take one reading that arrived at t_ns; a Record when it was a fresh magnetometer value."""
-        vehicle = self.vehicles.get(reading.system)
+        vehicle, system = self.vehicles.get(reading.system), reading.system
         if vehicle is None:
-            vehicle = self.vehicles[reading.system] = Vehicle(reading.system, self.settings, self._model, self._tap)
+            settings = self._own.get(system, self.settings)
+            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap)
         return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)

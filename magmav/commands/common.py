@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import msgspec
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from magmav.mavlink.signing import Signing, StampFile, read_key, readable_by_others
 from magmav.settings import Settings, checked, load
 
+_log = logging.getLogger("magmav")
 Result = dict[str, Any]
 
 
@@ -39,6 +43,16 @@ def settings_of(o: argparse.Namespace) -> Settings:
         settings = msgspec.structs.replace(settings, learn=msgspec.structs.replace(settings.learn, on_ground=True))
     settings = msgspec.convert(msgspec.to_builtins(settings), Settings)
     return checked(settings, "command line")
+
+
+def signer_of(o: argparse.Namespace, store: Path) -> Signing | None:
+    """What signs and checks, where a key file was given. Its timestamps are kept beside the store, per link id."""
+    if o.key_file is None:
+        return None
+    key = read_key(o.key_file)
+    if readable_by_others(o.key_file):
+        _log.warning("%s: others on this machine may read this key; chmod 600 it", o.key_file)
+    return Signing(key, o.link_id, StampFile(store.with_name(f"signing-{o.link_id}.json")))
 
 
 def show(o: argparse.Namespace, result: Result, view: Callable[[Any], RenderableType]) -> None:

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
-from magmav.commands.common import Refused, Result, settings_of, show, stderr_console
+from magmav.commands.common import Refused, Result, settings_of, show, signer_of, stderr_console
 from magmav.core.types import Change, Reading, Reason, Record
 from magmav.geomag import world_magnetic_model
 from magmav.link import Link, LinkError
@@ -40,9 +40,9 @@ def _until_signal(link: Link) -> Iterator[Callable[[], bool]]:
 def run(o: argparse.Namespace) -> int:
     """The service, until stopped."""
     from magmav.coaching import Coaching
-    from magmav.link.open import open_link
+    from magmav.fleet import serve
+    from magmav.link.many import open_links
     from magmav.link.recorder import TlogRecorder
-    from magmav.live import Session
     from magmav.notify import Notifier
     from magmav.store import Store, default_path
     from magmav.view.records import RecordWriter
@@ -54,7 +54,8 @@ def run(o: argparse.Namespace) -> int:
             settings = with_value(settings, "wire", key, 0.0)
     with ExitStack() as stack:
         store = stack.enter_context(Store(o.store or default_path()))
-        link: Link = _live(o.link, open_link)
+        signer = signer_of(o, store.path)
+        link = bare = open_links([_alive(text) for text in o.link])
         if o.record is not None:
             link = TlogRecorder(link, o.record)
         stopped = stack.enter_context(_until_signal(link))
@@ -62,26 +63,26 @@ def run(o: argparse.Namespace) -> int:
         if o.records is not None:
             writer = stack.enter_context(RecordWriter(o.records))
             watchers.append(lambda reading, record: None if record is None else writer.write(record))
-        session = Session.on(link, settings, world_magnetic_model, store, watchers)
-        coaching = Coaching(session.pipeline.vehicles, lambda text, _: _log.warning("%s", text))
-        session.service.watchers += (lambda reading, record: None if record is None else coaching.on_record(record),)
-        _warn(link)
-        port = getattr(link, "port", None)
-        _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {port})" if port else "")
+        service = serve(link, settings, world_magnetic_model, store, watchers, signer=signer)
+        coaching = Coaching(service.pipeline.vehicles, lambda text, _: _log.warning("%s", text))
+        service.watchers += (lambda reading, record: None if record is None else coaching.on_record(record),)
+        _warn(bare)  # a recorder around it has no port and warns of nothing
+        ports = ", ".join(str(one.port) for one in getattr(bare, "links", (bare,)) if hasattr(one, "port"))
+        _log.warning("listening on %s%s; stop with Ctrl-C", link.name, f" (port {ports})" if ports else "")
         until = _Deadline(o.for_s)
         notifier = Notifier.from_environment()
         notifier.ready(f"listening on {link.name}")
 
         def over() -> bool:
             """Asked after every packet and quiet tick, so who watches us sees that the work goes on."""
-            ends = stopped() or until(session.service.now_ns)
+            ends = stopped() or until(service.now_ns)
             if ends:
                 notifier.stopping()
             else:
-                notifier.beat(session.service.now_ns)
+                notifier.beat(service.now_ns)
             return ends
 
-        session.service.run(over)
+        service.run(over)
     return 0
 
 
@@ -97,11 +98,11 @@ class _Deadline:
         return now_ns - self._first_ns >= self._for_ns
 
 
-def _live(text: str, open_link: Callable[..., Link]) -> Link:
-    """A live link; a recording is no place to send anything to (S15)."""
+def _alive(text: str) -> str:
+    """The text of a live link; a recording is no place to send anything to (S15)."""
     if text.lower().endswith((".tlog", ".bin", ".log", ".ulg")):
         raise LinkError(f"{text}: a recording is not a live link; use `magmav replay`")
-    return open_link(text)
+    return text
 
 
 def _warn(link: Link) -> None:
@@ -110,7 +111,7 @@ def _warn(link: Link) -> None:
         _log.warning("%s", warning)
 
 
-def _transact(o: argparse.Namespace, pick: Callable[[Any, int, int], Any], confirm: int | None) -> Result:
+def _transact(o: argparse.Namespace, pick: Callable[[Any, Any, int], Any], confirm: int | None) -> Result:
     from magmav.link.open import open_link
     from magmav.live import Session, transact
     from magmav.store import Store, default_path
@@ -118,16 +119,17 @@ def _transact(o: argparse.Namespace, pick: Callable[[Any, int, int], Any], confi
     settings = settings_of(o)
     with ExitStack() as stack:
         store = stack.enter_context(Store(o.store or default_path()))
-        link = _live(o.link, open_link)
+        signer = signer_of(o, store.path)
+        link = open_link(_alive(o.link))
         stopped = stack.enter_context(_until_signal(link))
         _warn(link)
-        session = Session.on(link, settings, world_magnetic_model, store, ask=False)
+        session = Session.on(link, settings, world_magnetic_model, store, ask=False, signer=signer)
         say = stderr_console()
         return transact(
             session,
             link,
             o.compass,
-            lambda device: pick(store, session.companion.presence.system, device),
+            lambda device: pick(store, session.companion, device),
             confirm=confirm,
             dry=o.dry_run,
             wait_s=o.wait,
@@ -145,10 +147,10 @@ def upload(o: argparse.Namespace) -> int:
     except NotReady as error:
         raise Refused(str(error)) from None
 
-    def pick(store: Any, system: int, device: int) -> Change | Reason:
+    def pick(store: Any, companion: Any, device: int) -> Change | Reason:
         if given is not None:
             return given
-        saved = store.latest_estimate(system, device)
+        saved = store.latest_estimate(companion.presence.system, device, companion.writer.vehicle)
         return Reason.NO_CALIBRATION if saved is None else saved.change
 
     return _ended(o, _transact(o, pick, o.confirm_change), ("ALL_NEW",))
@@ -157,8 +159,9 @@ def upload(o: argparse.Namespace) -> int:
 def restore(o: argparse.Namespace) -> int:
     """Undo the last upload."""
 
-    def pick(store: Any, system: int, device: int) -> Any:
-        return store.last_restorable(system, o.compass, device) or Reason.NO_SNAPSHOT
+    def pick(store: Any, companion: Any, device: int) -> Any:
+        system, vehicle = companion.presence.system, companion.writer.vehicle
+        return store.last_restorable(system, o.compass, device, vehicle) or Reason.NO_SNAPSHOT
 
     return _ended(o, _transact(o, pick, None), ("ALL_OLD",))
 

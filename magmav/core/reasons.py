@@ -71,6 +71,7 @@ class Reason(Enum):
         "stored, but never calibrated before: the autopilot may still say not calibrated",
     )
 
+    LINK_SIGNED_READ_ONLY = (64, "the vehicle signs its messages and no key is held here: only listening")
 
     def __init__(self, number: int, text: str) -> None:
         self.number = number

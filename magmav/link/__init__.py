@@ -43,3 +43,15 @@ class Link(Protocol):
     def close(self) -> None:
         """Stop; the iterator of packets ends. Safe to call twice and from a signal handler."""
         ...
+
+
+def whole_frames(link: Link, route: str) -> bool:
+    """Whether packets of this route hold whole frames; several links in one may differ."""
+    told: bool = link.whole(route) if hasattr(link, "whole") else link.datagrams
+    return told
+
+
+def routes_of(link: Link) -> tuple[str, ...]:
+    """Whom send() with an empty route reaches, where a link can tell; empty where there is but one other end."""
+    told: tuple[str, ...] = getattr(link, "routes", ())
+    return told

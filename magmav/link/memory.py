@@ -51,6 +51,11 @@ class MemoryLink:
             else:
                 yield Packet(self._clock_ns(), b"", "")
 
+    @property
+    def routes(self) -> tuple[str, ...]:
+        """The other end."""
+        return () if self._other is None else (self._other.name,)
+
     def send(self, data: bytes, route: str = "") -> None:
         """To the other end; counted as "not sent" when either is closed or the route is not the other end."""
         other = self._other

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from magmav.link import Link, LinkError, Packet
+from magmav.link import Link, LinkError, Packet, routes_of, whole_frames
 from magmav.link.frames import V2, cut
 
 _FLUSH_NS = 1_000_000_000
@@ -62,10 +62,19 @@ class TlogRecorder:
                 self.unix_offset_ns = self._link.unix_offset_ns
                 self._tell(packet.t_ns)
                 if packet.data:
-                    self._record(packet.data, packet.route, whole=self.datagrams)
+                    self._record(packet.data, packet.route, whole=self.whole(packet.route))
                 yield packet
         finally:
             self._write()  # the reader may have stopped half way, and may come back
+
+    @property
+    def routes(self) -> tuple[str, ...]:
+        """The link's."""
+        return routes_of(self._link)
+
+    def whole(self, route: str) -> bool:
+        """As the link says."""
+        return whole_frames(self._link, route)
 
     def send(self, data: bytes, route: str = "") -> None:
         """Send, and record what was handed over (a link cannot know what arrived)."""

@@ -102,6 +102,15 @@ class StreamLink:
             self._unsent += data
             self._flush(self._port)
 
+    @property
+    def routes(self) -> tuple[str, ...]:
+        """The one other end, while there is one."""
+        return (self.route,) if self._connected else ()
+
+    def fileno(self) -> int:
+        """Readable when bytes wait; -1 while there is no connection."""
+        return self._port.fd if self._port is not None and self._connected else -1
+
     def close(self) -> None:
         """Close; the packets end within a tick."""
         self._closed = True

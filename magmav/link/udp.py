@@ -71,6 +71,10 @@ class UdpLink:
         """Whom send() with an empty route reaches."""
         return tuple(self._route.values())
 
+    def fileno(self) -> int:
+        """Readable when a datagram waits; -1 when closed."""
+        return self._sock.fileno()
+
     def packets(self) -> Iterator[Packet]:
         """Packets, and a quiet tick when nothing came for tick_s."""
         if self._closed:

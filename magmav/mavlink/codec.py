@@ -24,10 +24,14 @@ _LONGEST = 10 + 255 + 2 + 13
 
 
 class Outgoing(NamedTuple):
-    """A message some machine wants sent. An empty route means every peer of the link."""
+    """A message some machine wants sent. An empty route means every peer of the link that is no other vehicle.
+
+    sender : system and component it comes from; None where the service knows only one.
+    """
 
     message: Message
     route: str = ""
+    sender: tuple[int, int] | None = None
 
 
 class Signer(Protocol):
