@@ -1,0 +1,33 @@
+"""dronekit2 as a ground station: it sends every PARAM_SET to component 0. Prints one JSON document.
+
+python dronekit_ground.py PORT
+"""
+
+import json
+import sys
+import time
+
+from dronekit import connect
+
+
+def main():
+    vehicle = connect(f"udpout:127.0.0.1:{sys.argv[1]}", wait_ready=["parameters"], timeout=60)
+    out = {"armed": vehicle.armed}
+    end = time.monotonic() + 30.0
+    while "MMAG_LEARN" not in vehicle.parameters and time.monotonic() < end:
+        time.sleep(0.2)
+    ours = [name for name in vehicle.parameters if name.startswith("MMAG_")]
+    out["ours"] = len(ours)
+    out["before"] = vehicle.parameters["MMAG_LEARN"]
+    out["set"] = vehicle.parameters.set("MMAG_LEARN", 0.0, retries=3)
+    out["after"] = vehicle.parameters["MMAG_LEARN"]
+    out["vehicle set"] = vehicle.parameters.set("COMPASS_OFS_Z", 11.5, retries=3)
+    out["vehicle after"] = vehicle.parameters["COMPASS_OFS_Z"]
+    # A trigger wants exactly our component: dronekit2 cannot give it, and is told the old value.
+    out["trigger"] = vehicle.parameters.set("MMAG_UPLOAD", 1.0, retries=1)
+    out["trigger after"] = vehicle.parameters["MMAG_UPLOAD"]
+    print(json.dumps(out), flush=True)
+    vehicle.close()
+
+
+main()

@@ -1,0 +1,110 @@
+"""MAVProxy 1.8.75: the plugin in its console on its own link, and its console against `magmav run` behind a router."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import pytest
+from flight_rig import LEVEL
+from process_rig import free_port
+from rig import magmav_words, peer, program, stage
+from sim_rig import COMPASS, HEAD
+
+from magmav.store import Store
+
+pytestmark = pytest.mark.peers
+GROUNDED = HEAD + "stay = true\n" + COMPASS
+_OFFSETS = {"X": -180.0, "Y": 120.0, "Z": -240.0}  # against the iron of LEVEL, mG
+
+
+def console(folder, *options):
+    """MAVProxy's console without windows."""
+    python = peer("wire-mavproxy")
+    words = [python, python.with_name("mavproxy.py"), f"--state-basedir={folder}", "--aircraft=t"]
+    return program([*words, "--default-modules=link,param,cmdlong,ftp", *options], folder)
+
+
+def ask_until(mavproxy, line, pattern):
+    """MAVProxy sends a PARAM_SET in its own time: ask again until the answer is the new one."""
+    for _ in range(20):
+        mavproxy.say(line)
+        with suppress(AssertionError):
+            return mavproxy.expect(pattern, within_s=1.0)
+    raise AssertionError("\n".join([f"never {pattern!r} in", *mavproxy.lines[-40:]]))
+
+
+def test_the_plugin_learns_uploads_and_restores_from_mavproxys_console(tmp_path):
+    (scenario := tmp_path / "staying.toml").write_text(LEVEL.format(seed=32))
+    port = free_port()
+    with console(tmp_path, f"--master=udpin:127.0.0.1:{port}", "--load-module=magmav.mavproxy") as mavproxy:
+        mavproxy.expect("Loaded module magmav.mavproxy")
+        mavproxy.expect("magmav: at work")
+        mavproxy.say("magmav status")
+        mavproxy.expect("magmav: no vehicle yet")
+        mavproxy.say("module load magmav.mavproxy")
+        mavproxy.expect("already loaded")
+        with program(magmav_words("sim", scenario, "--to", f"udpout:127.0.0.1:{port}", "--speed", 8), tmp_path):
+            mavproxy.expect("magmav: compass 1 of system 1: ready")
+            mavproxy.expect("DISARMED")
+            ask_until(mavproxy, "magmav status", "magmav: system 1, ArduPilot, disarmed, mavproxy:1")
+            mavproxy.say("magmav upload 9")
+            mavproxy.expect("magmav: upload: compass: want a whole number from 1 to 3, got '9'")
+            mavproxy.say("magmav upload")
+            code = mavproxy.expect(r"magmav upload 1 --confirm-change (\d+)").group(1)
+            mavproxy.say(f"magmav upload 1 --confirm-change {code}")
+            mavproxy.expect("magmav: compass 1: upload begun")
+            mavproxy.expect("magmav: compass 1: ALL_NEW")
+            for axis, value in _OFFSETS.items():
+                # MAVProxy's own view of the vehicle: it heard the PARAM_VALUEs as we did.
+                mavproxy.say(f"param show COMPASS_OFS_{axis}")
+                shown = float(mavproxy.expect(rf"COMPASS_OFS_{axis} +(-?[\d.]+)").group(1))
+                assert shown == pytest.approx(value, abs=20.0)
+            mavproxy.say("magmav restore")
+            mavproxy.expect("magmav: compass 1: ALL_OLD")
+            mavproxy.say("param show COMPASS_OFS_X")
+            assert float(mavproxy.expect(r"COMPASS_OFS_X +(-?[\d.]+)").group(1)) == 0.0
+            mavproxy.say("magmav history")
+            mavproxy.expect("magmav: 2: .*undo of 1 ALL_OLD")
+            mavproxy.say("module unload magmav.mavproxy")
+            mavproxy.expect("Unloaded module magmav.mavproxy")
+            mavproxy.say("magmav status")
+            mavproxy.expect("Unknown command")
+        mavproxy.end()
+    with Store(tmp_path / "magmav" / "magmav.sqlite") as store:
+        assert [row.result.name for row in store.history()] == ["ALL_OLD", "ALL_NEW"]
+
+
+def test_mavproxy_fetches_sets_and_saves_our_parameters_and_sets_an_offset(tmp_path):
+    with (
+        stage(tmp_path, GROUNDED) as hub,
+        console(tmp_path, f"--master=udpout:127.0.0.1:{hub.port}", "--streamrate=-1") as mavproxy,
+    ):
+        mavproxy.expect("Detected vehicle 1:1 ")
+        mavproxy.expect("Detected vehicle 1:191 ")
+        # The vehicle first. FTP off: the simulated autopilot has no files and MAVProxy would wait for them.
+        mavproxy.say("set param_ftp False")
+        mavproxy.say("vehicle 1:1")
+        mavproxy.say("param fetch")
+        mavproxy.expect(r"Received \d+ parameters")
+        mavproxy.say("param set COMPASS_OFS_X 42.5")
+        ask_until(mavproxy, "param fetch COMPASS_OFS_X", r"COMPASS_OFS_X = 42\.5")
+        # Ours, with FTP on again: what answers there must not keep MAVProxy from the list.
+        mavproxy.say("set param_ftp True")
+        mavproxy.say("vehicle 1:191")
+        mavproxy.say("param fetch")
+        count = int(mavproxy.expect(r"Received (\d+) parameters", within_s=30.0).group(1))
+        mavproxy.say("param set MMAG_LEARN 0")
+        ask_until(mavproxy, "param fetch MMAG_LEARN", r"MMAG_LEARN = 0\.0")
+        mavproxy.say("param save out.parm")
+        mavproxy.expect(r"Saved \d+ parameters to out.parm")
+        mavproxy.end()
+    saved = dict(line.split()[:2] for line in (tmp_path / "out.parm").read_text().splitlines() if line[:1] != "#")
+    ours = {name: float(value) for name, value in saved.items() if name.startswith("MMAG_")}
+    assert ours["MMAG_LEARN"] == 0.0
+    assert ours["MMAG_UPLOAD"] == 0.0
+    assert count >= 30
+    assert len(ours) >= count - sum(name not in ours for name in _UNKNOWN)
+
+
+# NaN while nothing is known; MAVProxy keeps those out of a saved file.
+_UNKNOWN = ("MMAG_HDG", "MMAG_HDG_T", "MMAG_HDG_SD")
