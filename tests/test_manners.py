@@ -354,6 +354,26 @@ def test_the_smallest_budget_still_lists_every_parameter():
     assert desk.most_in_ten_seconds() <= 1000
 
 
+def test_S14_rates_chosen_in_a_storm_are_asked_for_once_in_ten_seconds():
+    presence = Presence(target_system=7)
+    presence.on_message(WIRE.carry(beat(2, 3), *AUTOPILOT), "radio", 0)
+    machine = Intervals({"RAW_IMU": 10.0}, presence)
+    asked = []
+    for n in range(3000):  # a minute
+        machine.want({"RAW_IMU": 5.0 + n % 40})
+        for item in machine.poll(n * 20 * MS):
+            asked.append((n * 20 * MS, item.message.param2))
+            ack = dialect.MAVLink_command_ack_message(511, 0, 0, 0, *US)
+            asked += [
+                (n * 20 * MS, o.message.param2)
+                for o in machine.on_message(WIRE.carry(ack, *AUTOPILOT), "radio", n * 20 * MS)
+            ]
+    assert len(asked) == 6 and all(b - a >= 10 * S for (a, _), (b, _) in pairwise(asked))
+    for n in range(3000, 3600):
+        asked += [(n, o.message.param2) for o in machine.poll(n * 20 * MS)]
+    assert asked[-1][1] == round(1e6 / (5.0 + 2999 % 40)), "and the last word is said"
+
+
 IDS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 
 
@@ -380,7 +400,7 @@ def test_S14_whatever_was_wanted_in_turn_the_vehicle_ends_with_the_last_and_gets
     wanted = {"RAW_IMU": 10.0}
     for wanted in turns:
         machine.want(wanted)
-        for _ in range(10):
+        for _ in range(110):
             now_ns += 100 * MS
             obey(machine.poll(now_ns))
         assert {i for i, us in holds.items() if us} == {IDS[name] for name in wanted}

@@ -34,6 +34,7 @@ class _Stream:
     rate_hz: float = math.nan  # over the last window
     tries: int = 0  # of the first request
     next_ns: int = 0  # no request before
+    asked_ns: int = -FIRST_PAUSE_NS  # the last request
     pause_ns: int = FIRST_PAUSE_NS
     refused: bool = False
     changed: bool = False  # we sent at least one request
@@ -57,7 +58,10 @@ class Intervals:
         self._window_ns: int | None = None
 
     def want(self, wanted: Mapping[str, float]) -> None:
-        """Other rates from now on: what changed is asked for again, what is wanted no more is given back."""
+        """Other rates from now on: what changed is asked for again, what is wanted no more is given back.
+
+        Each message at most once in ten seconds: whoever changes his mind faster must not drum on the vehicle.
+        """
         self._wanted = _checked(wanted)
         for name in {**self._streams, **self._wanted}:
             stream = self._streams.setdefault(name, _Stream(0, 0.0))
@@ -65,7 +69,7 @@ class Intervals:
             if hz == stream.hz:
                 continue
             stream.hz, stream.interval_us = hz, round(1e6 / hz) if hz else 0
-            stream.tries = stream.next_ns = 0
+            stream.tries, stream.next_ns = 0, stream.asked_ns + FIRST_PAUSE_NS
             stream.pause_ns = FIRST_PAUSE_NS
             if name in self._queue:
                 self._queue.remove(name)
@@ -114,7 +118,11 @@ class Intervals:
             if self._streams[self._waiting].tries < TRIES:
                 self._queue.appendleft(self._waiting)
             self._waiting = ""
-        return [self._request(autopilot, self._queue.popleft(), now_ns)] if self._queue else []
+        name = next((n for n in self._queue if self._streams[n].tries or now_ns >= self._streams[n].next_ns), None)
+        if name is None:
+            return []
+        self._queue.remove(name)
+        return [self._request(autopilot, name, now_ns)]
 
     def restore(self) -> list[Outgoing]:
         """Default intervals again for everything we changed (S14); for the way out."""
@@ -129,6 +137,7 @@ class Intervals:
     def _request(self, autopilot: Autopilot, name: str, now_ns: int) -> Outgoing:
         stream = self._streams[name]
         stream.tries += 1
+        stream.asked_ns = now_ns
         stream.changed = stream.hz > 0.0
         stream.next_ns = max(stream.next_ns, now_ns + FIRST_PAUSE_NS)
         self._waiting, self._sent_ns = name, now_ns
