@@ -109,7 +109,7 @@ class Director:
             else:
                 companion.request_restore(compass, now_ns)
         elif self.act is Act.UPLOAD:
-            companion.choose("learn", "on", 0.0)
+            companion.choose("learn", "on", 0.0, keep=False)
             self.act = Act.SECOND_FLIGHT
         elif self.act is Act.SECOND_FLIGHT and not self._armed and not self.flights[1]:
             self._start_mission(now_ns)
