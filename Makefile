@@ -28,12 +28,17 @@ test: $(VENV)/.ready
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2
 
+# Hours on two cores; each takes how much as its first argument, and tells what it has when it is cut short.
 soak: $(VENV)/.ready
 	$(BIN)/python benchmarks/soak.py
+	$(BIN)/python benchmarks/soak_upload.py
+	$(BIN)/python benchmarks/fuzz_wire.py
+	$(BIN)/python benchmarks/day.py
 
-# The second wants a real .bin log and says so (exit 3) where there is none.
+# The last wants a real .bin log and says so (exit 3) where there is none.
 bench: $(VENV)/.ready
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/fleet_cost.py
 	$(BIN)/python benchmarks/logs.py || test $$? -eq 3
 
 papers: $(VENV)/.ready

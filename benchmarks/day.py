@@ -16,10 +16,12 @@ import gc
 import math
 import os
 import random
+import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -389,15 +391,19 @@ def draw(log: Log, path: Path) -> None:
 def main(argv: list[str]) -> int:
     """Live through it, print the table, draw the figure; 1 when a bound is broken."""
     hours, seed, path = (*argv, *("24", "1", str(Path(__file__).parents[1] / "docs" / "day.png"))[len(argv) :])
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # cut short, it tells what it has
     begun = time.process_time()
     with TemporaryDirectory() as folder, Store(Path(folder) / "day.sqlite") as store:
         day = Day(int(seed), store)
         with Progress(console=Console(stderr=True)) as progress:
             task = progress.add_task(f"{hours} h", total=float(hours) * HOUR)
-            day.run(float(hours), lambda s: progress.advance(task, s))
+            with suppress(KeyboardInterrupt):
+                day.run(float(hours), lambda s: progress.advance(task, s))
     draw(day.log, Path(path))
-    stated = rows(day.log, float(hours))
-    table = Table(title=f"{hours} simulated hours in {time.process_time() - begun:.0f} s of processor time")
+    stated = rows(day.log, day.log.hours[-1])
+    table = Table(
+        title=f"{day.log.hours[-1]:.1f} simulated hours in {time.process_time() - begun:.0f} s of processor time"
+    )
     for head in ("what", "measured", "bound", "kept"):
         table.add_column(head)
     for row in stated:

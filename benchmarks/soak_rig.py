@@ -44,6 +44,7 @@ class Line:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self.routes: tuple[str, ...] = ()  # that were heard from, as a socket's peers: the last sixteen
         self.sent: list[tuple[bytes, str]] = []
 
     def packets(self) -> Iterator[Packet]:
@@ -126,12 +127,14 @@ class Crew:
 
     def take(self, packet: Packet) -> list[Outgoing]:
         """One packet into the service: what it sends, as the witness parsed it."""
+        if packet.route and packet.route not in self.line.routes:
+            self.line.routes = (*self.line.routes, packet.route)[-16:]
         self.session.service.turn(packet)
         sent, self.line.sent = self.line.sent, []
         self.bytes_out += sum(len(frame) for frame, _ in sent)
         out = [Outgoing(self.witness.sees(frame, packet.t_ns), route) for frame, route in sent]
-        for message, _ in out:
-            self.on_sent(message, packet.t_ns)
+        for item in out:
+            self.on_sent(item.message, packet.t_ns)
         return out
 
     def _was_set(self, name: str) -> None:
