@@ -98,14 +98,15 @@ class Writer:
 
     def request_upload(self, compass: int, now_ns: int) -> None:
         """Upload what is known now, if the gate says it may be."""
-        record = self.fresh(compass, now_ns)
+        record, flown = self.fresh(compass, now_ns), self.flown()
         change = self.plan(compass)
+        unclear = None if flown is None else flown.calibrations.refuses(compass)
         if self.job is not None or not self._serves:
             self.refuse(Reason.BUSY, now_ns)
         elif record is None or record.verdict.state is not State.READY:
             self.refuse(Reason.NO_CALIBRATION, now_ns)
         elif change is None:
-            self.refuse(Reason.NOT_OBSERVED, now_ns)
+            self.refuse(unclear or Reason.NOT_OBSERVED, now_ns)
         else:
             self.start(change, int(self.confirm), now_ns)
 
@@ -113,7 +114,11 @@ class Writer:
         """Bring back the values from before the last upload of this compass."""
         flown = self.flown()
         device = 0 if flown is None else flown.calibrations.device_id(compass)
-        row = self._store.last_restorable(self._presence.system, compass, device, self.vehicle)
+        try:
+            row = self._store.last_restorable(self._presence.system, compass, device, self.vehicle)
+        except StoreError as error:
+            _log.error("%s", error)
+            row = None
         if self.job is not None or not self._serves:
             self.refuse(Reason.BUSY, now_ns)
         elif row is None:
@@ -137,7 +142,6 @@ class Writer:
         limits = UploadSettings(confirm_above_mg=self._settings().upload.confirm_above_mg)
         self.refusal = None
         flown = self.flown()
-        self._kept.pop(change.device_id, None)
         self.job = Upload(
             change,
             self._watch,
@@ -241,7 +245,10 @@ class Writer:
 
     def _await_reboot(self, job: Upload) -> None:
         """Note the autopilot's clock with a write that left known values; see Kept."""
-        if job.row is None or self._boot_ms is None or job.result not in _WHOLE:
+        if job.row is None:
+            return
+        self._kept.pop(job.change.device_id, None)  # what an earlier write left is not there any more
+        if self._boot_ms is None or job.result not in _WHOLE:
             return
         try:
             self._store.ended_at(job.row, self._boot_ms)

@@ -1,0 +1,93 @@
+"""Who asks for a write, for which compass of which vehicle: the refusals that come before the transaction."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from magmav_sim import Simulation, parse_scenario
+from magmav_sim.link import SimulatedLink
+from scripted_vehicle import Vehicle
+from test_kept import Bench
+from test_store_format import SAVED, VERDICT
+from test_upload_far import GROUND
+from upload_rig import NAMES, OLD, Rig, a_change, refused
+
+from magmav.cli import main
+from magmav.core.types import Change, Reason, UploadResult
+from magmav.store import SavedEstimate, Store
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        ({"COMPASS_DEV_ID": 131874.0}, Reason.DEVICE_CHANGED),
+        ({"COMPASS_DEV_ID": None}, Reason.UNKNOWN_PARAM),
+    ],
+)
+def test_AT_6b_device_id_changed_or_missing_is_refused_and_nothing_written(
+    spoil: dict[str, float | None], why: Reason
+) -> None:
+    rig = Rig()
+    for name, value in spoil.items():
+        if value is None:
+            del rig.vehicle.params[name]
+        else:
+            rig.vehicle.params[name] = value
+    refused(rig, why)
+    refused(rig, why, undoes=7)
+
+
+def test_AT_6b_device_id_that_two_compasses_have_is_refused_and_nothing_written(tmp_path: Path) -> None:
+    vehicle = Vehicle()
+    vehicle.params["COMPASS_DEV_ID2"] = vehicle.params["COMPASS_DEV_ID"]
+    bench = Bench(tmp_path / "s.sqlite", vehicle)
+    bench.run(12.0)
+    bench.companion.start(a_change(), None, vehicle.now_ns)
+    bench.run(0.1)
+    ended = bench.companion.ended
+    assert ended is not None and ended.result is UploadResult.REFUSED
+    assert ended.reasons == (Reason.MAPPING_UNCLEAR,)
+    assert tuple(vehicle.params[n] for n in NAMES) == OLD and bench.store.history() == []
+    bench.store.close()
+
+
+def test_AT_4c_a_refused_write_does_not_end_the_wait_for_the_reboot_of_the_one_before(tmp_path: Path) -> None:
+    vehicle = Vehicle()
+    bench = Bench(tmp_path / "s.sqlite", vehicle)
+    bench.run(12.0)
+    bench.companion.start(a_change(), None, vehicle.now_ns)
+    bench.run(16.0)
+    assert bench.companion.ended is not None and bench.companion.ended.result is UploadResult.ALL_NEW
+    bench.companion.start(a_change(), None, vehicle.now_ns)  # the old values are not there any more
+    bench.run(14.0)
+    assert bench.companion.ended.result is UploadResult.REFUSED
+    bench.boot_ms = 3_000
+    bench.run(20.0)
+    assert any("PERSISTED" in text for text in bench.texts), bench.texts
+    bench.store.close()
+
+
+@pytest.mark.parametrize(("uid", "known"), [("00ff00ff", False), (None, True), ("", True)])
+def test_S19_what_was_learnt_on_another_vehicle_is_not_uploaded_to_this_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], uid: str | None, known: bool
+) -> None:
+    """`magmav upload` on a vehicle of the same system id with the same compass device id, the same offsets even."""
+    simulation = Simulation(parse_scenario(GROUND, "ground.toml"), 3)
+    monkeypatch.setattr("magmav.link.open.open_link", lambda text: SimulatedLink(simulation, until_s=90.0))
+    path = tmp_path / "s.sqlite"
+    own = simulation.autopilot.uid.to_bytes(18, "little").rstrip(b"\0").hex() if uid is None else uid  # its uid2
+    new = (-100.0, 50.0, -60.0)
+    change = Change(1, 1, "COMPASS_DEV_ID", 97539, NAMES, (0.0,) * 3, new, new, (2.0,) * 3, tuple(map(abs, new)))
+    vehicle = f"1 uid {own}" if own else "1"
+    with Store(path) as store:
+        store.save_estimate(SavedEstimate(7, vehicle, change, VERDICT, SAVED.offsets_mg, SAVED.sigma_mg))
+    code = main(["upload", "udpin:127.0.0.1:0", "--store", str(path), "--json"])
+    out = json.loads(capsys.readouterr().out)
+    held = tuple(float(simulation.autopilot.parameters[name]) for name in NAMES)
+    if known:
+        assert (code, out["result"], held) == (0, "ALL_NEW", new)
+    else:
+        assert (code, out["result"], held) == (1, "REFUSED", (0.0, 0.0, 0.0))
+        assert [r["code"] for r in out["reasons"]] == ["NO_CALIBRATION"]
