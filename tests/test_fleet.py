@@ -96,6 +96,16 @@ def test_S13_nothing_addressed_to_others_is_answered(tmp_path: Path, target: tup
     assert {m.settings.wire.heading_hz for m in sky.fleet.members.values()} == {Settings().wire.heading_hz}
 
 
+def test_what_is_said_to_all_on_a_vehicles_route_is_for_that_vehicle(tmp_path: Path) -> None:
+    sky = Airspace(tmp_path, Craft(1, "udp:1"), Craft(2, "udp:2"))
+    sky.run(8.0)
+    for route, answers in (("udp:1", [1]), ("udp:2", [2]), ("gcs", [1, 2])):
+        before = len(sky.link.sent[route])
+        sky.push(ground(dialect.MAVLink_ping_message(7, 7, 0, 0)), route)
+        got = [m.get_srcSystem() for m in sky.link.sent[route][before:] if m.get_type() == "PING"]
+        assert sorted(got) == answers, route
+
+
 def test_a_setting_of_one_vehicle_is_not_the_others(tmp_path: Path) -> None:
     sky = Airspace(tmp_path, Craft(1, "udp:1"), Craft(2, "udp:2"))
     sky.run(8.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,45 @@ def test_sockets_one_busy_one_quiet_and_both_answered() -> None:
         link.close()
         busy.close()
         quiet.close()
+
+
+class Scripted:
+    """A link with a descriptor that is always, or never, readable; every look moves its time by 5 ms."""
+
+    datagrams, unix_offset_ns = True, 0
+
+    def __init__(self, name: str, clock: SetClock, busy: bool) -> None:
+        self.name, self.clock, self.busy = name, clock, busy
+        self.counts: Counter[str] = Counter()
+        self.mine, self.other = socket.socketpair()
+        if busy:
+            self.other.send(b"x")
+
+    def fileno(self) -> int:
+        return self.mine.fileno()
+
+    def packets(self):
+        while True:
+            self.counts[f"looks at {self.name}"] += 1
+            self.clock.advance(0.005 if self.busy else 0.0)
+            yield Packet(self.clock(), b"data" if self.busy else b"", self.name if self.busy else "")
+
+    def send(self, data: bytes, route: str = "") -> None:
+        pass
+
+    def close(self) -> None:
+        self.mine.close()
+        self.other.close()
+
+
+def test_a_busy_link_never_keeps_a_quiet_one_from_being_looked_after() -> None:
+    clock = SetClock(10**9)
+    many = ManyLinks([Scripted("busy", clock, True), Scripted("quiet", clock, False)])
+    packets = many.packets()
+    got = [next(packets) for _ in range(200)]
+    assert all(p.data for p in got)
+    assert 40 <= many.counts["looks at quiet"] <= 60, "every 20 ms of a second"
+    many.close()
 
 
 def test_one_text_is_that_link_and_a_bad_one_leaves_none_open() -> None:

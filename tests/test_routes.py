@@ -103,7 +103,10 @@ def test_a_vehicle_that_speaks_from_elsewhere_after_silence_is_learnt_anew(tmp_p
     last = sky.ms
     for ms, data in flight(seconds=9.0, seed=4, from_ms=last + 2000, told=None):
         sky.ms = ms
+        held = member.presence.autopilot.route
         sky.push(data, "udp:66")
+        if held == "udp:1" and member.presence.autopilot.route == "udp:66":
+            assert member._records == {}, "nothing of before is planned with, not even for a moment"
         if ms < last + 4500:
             assert member.presence.autopilot.route == "udp:1" and estimate(sky)[0] == samples
     assert member.presence.autopilot.route == "udp:66"
@@ -111,6 +114,20 @@ def test_a_vehicle_that_speaks_from_elsewhere_after_silence_is_learnt_anew(tmp_p
     assert member.plan(1) is None and not sky.service.pipeline.vehicles[1].calibrations.known(1)
     asked = [m.param_id for m in sky.link.sent["udp:66"] if m.get_type() == "PARAM_REQUEST_READ"]
     assert "COMPASS_OFS_X" in asked, "all that the write rests on is read again, over the new route"
+
+
+def test_before_anybody_is_chosen_too_only_the_first_route_counts(tmp_path: Path) -> None:
+    """A single companion waits three seconds for others; what it hears meanwhile already counts, but not from all."""
+    sky = Airspace(tmp_path, single=True)
+    craft, liar = Craft(1, "udp:1"), Craft(1, "udp:66")
+    sky.push(craft.heartbeat(), "udp:1")
+    sky.push(liar.heartbeat(), "udp:66")
+    for n in range(10):
+        sky.push(liar.imu(1000 + 40 * n), "udp:66")
+    assert sky.records == [] and sky.service.companion.presence.autopilot is None
+    for n in range(10):
+        sky.push(craft.imu(1000 + 40 * n), "udp:1")
+    assert len(sky.records) > 5
 
 
 def test_a_stream_that_was_reopened_is_the_same_vehicle(tmp_path: Path) -> None:
