@@ -130,7 +130,7 @@ def write_view(result: Json) -> RenderableType:
             table.add_row(*(_line(cell) for cell in cells))
         parts.append(table)
     if result.get("dry_run"):
-        parts += [_line("Nothing was written. These messages go out when it is:"), *(_line(f"  {m}") for m in result["messages"])]
+        parts += [_line("Nothing was written. To write, these go out:"), *(_line(f"  {m}") for m in result["messages"])]
     else:
         parts.append(_line(_outcome(result.get("result")), "bold"))
     parts += [_line(f"  {reason.get('text')}") for reason in result.get("reasons") or []]
