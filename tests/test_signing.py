@@ -240,7 +240,7 @@ def test_key_files_in_every_form_give_the_same_key(tmp_path: Path) -> None:
 
 
 def test_a_passphrase_is_hashed_as_mavproxy_hashes_it(tmp_path: Path) -> None:
-    """MAVProxy, Mission Planner and QGroundControl: SHA-256 of the words. The digest below is sha256sum's."""
+    """mavproxy_signing.py: SHA-256 of the words. The digest below is sha256sum's."""
     (tmp_path / "k").write_text("passphrase:abc")
     assert read_key(tmp_path / "k").hex() == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 

@@ -52,7 +52,7 @@ def read_key(path: Path) -> bytes:
     """The 32 bytes of a key file. SigningError when it cannot be read or is none of the forms.
 
     Forms: 32 raw bytes; 64 hexadecimal digits; base64 of 32 bytes; ``passphrase:WORDS``, whose SHA-256 is the key, as
-    MAVProxy, Mission Planner and QGroundControl make theirs (UTF-8, without the end of the line).
+    MAVProxy makes its own (mavproxy_signing.py; UTF-8, without the end of the line).
     """
     try:
         with path.open("rb") as file:
