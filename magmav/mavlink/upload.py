@@ -94,6 +94,7 @@ class Upload:
         self._retreating = False
         self._round = 0
         self._start_ns = self._since_ns = 0
+        self._waits_ns = 0  # when the last heartbeat fresh enough to write by was there
         self._pin: tuple[int, int, str] = (0, 0, "")
         self._boots = 0
         self._out: list[Outgoing] = []
@@ -247,8 +248,10 @@ class Upload:
             self._enter(Phase.LINGER if back else Phase.READ_BACK, now_ns)
             return
         not_now = wait_reasons(self._watch, self._set, now_ns)
-        if not_now and now_ns - self._since_ns >= self._set.heartbeat_lost_ns:
-            self._stop(*not_now)
+        if not not_now:
+            self._waits_ns = now_ns
+        elif now_ns - max(self._waits_ns, self._since_ns) >= self._set.heartbeat_lost_ns:
+            self._stop(*not_now)  # a link that only stammers is waited for: the wait is counted from the last fresh one
             return
         age_ns = self._watch.heartbeat_age_ns(now_ns)
         late = self._talk.asking.untouched and (age_ns is None or age_ns > self._set.first_write_age_ns)
