@@ -107,6 +107,7 @@ class Crew:
         self.witness = Witness(self.vehicle)
         self.until: Callable[[], bool] = lambda: False
         self.bytes_out = 0
+        self.armed_meanwhile = 0  # messages handed over while a write ran and the last heartbeat said armed
         self.landed_armed = 0  # PARAM_SETs that reached the vehicle when it was armed already
         self.on_set: Callable[[], None] = lambda: None
         self.on_sent: Callable[[Any, int], None] = lambda message, now_ns: None
@@ -120,6 +121,7 @@ class Crew:
 
     def on_message(self, message: Any, route: str, now_ns: int) -> list[Outgoing]:
         self.witness.hears(message, now_ns)
+        self.armed_meanwhile += self.witness.armed and self.session.companion.job is not None
         return self.take(Packet(now_ns, bytes(message.get_msgbuf()), route))
 
     def poll(self, now_ns: int) -> list[Outgoing]:

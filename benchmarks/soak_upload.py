@@ -117,7 +117,7 @@ class Timing:
     landed_armed: int
     undetected: bool  # a write landed on the armed vehicle, we heard of it, and it was called a success
     kept: bool  # the vehicle holds what the end says, and the old values after a restore
-    said_armed: bool  # a heartbeat that says armed was handed to us before the end
+    said_armed: bool  # a heartbeat that says armed was handed to us while the write ran
 
     @property
     def wrong(self) -> bool:
@@ -146,11 +146,11 @@ def _arming(crew: Crew, batch: int, number: int) -> Timing:
         _at(crew, dice.uniform(0.05, 6.0 if vehicle.applies else 16.0), spoil)
     else:
         _at_set(crew, dice.randint(1, 6), dice.choice((0.0, 0.02, dice.uniform(0.0, 1.2))), spoil)
-    before = (w.sets, w.after_armed, w.stale, w.foreign, crew.landed_armed, w.armed_heard)
+    before = (w.sets, w.after_armed, w.stale, w.foreign, crew.landed_armed, crew.armed_meanwhile)
     old, change = crew.held(), crew.change()
     result = crew.write(change, seconds=150.0)
     slow_s = most_ms / 1000 + 0.1
-    said_armed, landed = w.armed_heard > before[5], crew.landed_armed > before[4]
+    said_armed, landed = crew.armed_meanwhile > before[5], crew.landed_armed > before[4]
     success = result in (UploadResult.ALL_NEW, UploadResult.ALL_OLD)
     crew.run(slow_s)  # whatever is under way has arrived
     kept = _keeps_its_word(crew, result, old, change.new)
