@@ -280,7 +280,8 @@ class Fuzz:
         turn.ends["no result" if result is None else result.name] += 1
         if result is UploadResult.ALL_NEW:
             self._old = self._new
-        if result is not UploadResult.PENDING_RESTORE and held != self._old:
+        # While a write is pending its undo may be refused (a second route is claimed), and says so truly.
+        if not self.crew.store.pending() and held != self._old:
             turn.ends["broken word"] += 1
 
     def _judge(self) -> None:
