@@ -1,7 +1,8 @@
 """Answers that every polite component owes: to PING, to commands it does not know, to file requests.
 
 Without them ground stations wait for their timeouts. All are addressed to the asker, on the asker's route. Nobody can
-make us talk without end: PINGs are answered a few times a second, commands only while no debt has grown.
+make us talk without end: PINGs of others than the vehicle are answered a few times a second, commands only while no
+debt has grown.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from magmav.mavlink.ftp import FileServer
 _COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 _PING_REPEATS = 3
 _PINGS_PER_S = 5.0
+_OWN_PINGS_PER_S = 400.0  # of the vehicle we belong to: a simulated one keeps step with us by them
 _MOST_PINGERS = 64
 _MOST_DEBT_S = 2.0  # a command is answered at once unless somebody floods us
 
@@ -37,8 +39,8 @@ class Manners:
         self._files = dict(files or {})
         self._server = FileServer(self._files, self._budget)
         self._pinged: dict[tuple[int, int], tuple[tuple[int, int], int]] = {}
-        self._pings = _PINGS_PER_S
-        self._ping_ns = 0
+        self._pings = {False: _PINGS_PER_S, True: _OWN_PINGS_PER_S}  # that may be answered now; of the vehicle's own
+        self._ping_ns = {False: 0, True: 0}
 
     def reply(self, message: Message, route: str, system: int, component: int, now_ns: int) -> list[Outgoing]:
         """What is to be said to one message at once; broadcast or others' commands are nobody's business here."""
@@ -84,12 +86,14 @@ class Manners:
             del self._pinged[next(iter(self._pinged))]  # who has been silent longest
         if target == we and times > _PING_REPEATS:
             return None
-        self._pings = min(_PINGS_PER_S, self._pings + max(now_ns - self._ping_ns, 0) * _PINGS_PER_S / 1e9)
-        self._ping_ns = now_ns
-        if self._pings < 1.0:
+        own = sender[0] == we[0]
+        most = _OWN_PINGS_PER_S if own else _PINGS_PER_S
+        self._pings[own] = min(most, self._pings[own] + max(now_ns - self._ping_ns[own], 0) * most / 1e9)
+        self._ping_ns[own] = now_ns
+        if self._pings[own] < 1.0:
             self.counts["pings dropped"] += 1
             return None
-        self._pings -= 1.0
+        self._pings[own] -= 1.0
         return dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender)
 
 
