@@ -16,7 +16,11 @@ def main():
     end = time.monotonic() + 30.0
     while "MMAG_LEARN" not in vehicle.parameters and time.monotonic() < end:
         time.sleep(0.2)
-    ours = [name for name in vehicle.parameters if name.startswith("MMAG_")]
+    ours, grew = [], time.monotonic()
+    while time.monotonic() - grew < 4.0 and time.monotonic() < end:  # the list is paced by our budget
+        now = [name for name in vehicle.parameters if name.startswith("MMAG_")]
+        ours, grew = now, grew if len(now) == len(ours) else time.monotonic()
+        time.sleep(0.2)
     out["ours"] = len(ours)
     out["before"] = vehicle.parameters["MMAG_LEARN"]
     out["set"] = vehicle.parameters.set("MMAG_LEARN", 0.0, retries=3)
