@@ -28,10 +28,10 @@ from magmav.core.types import (
     mat3,
     vec3,
 )
+from magmav.mavlink.autopilot.allowed import COMPASSES
 from magmav.mavlink.autopilot.ardupilot_names import (
     AXES,
     CLASSIC,
-    COMPASSES,
     MOTCT,
     NUMBERED,
     ArduPilot,

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.core.types import Change
+from magmav.mavlink.autopilot.allowed import COMPASSES, allowed
 from magmav.mavlink.codec import Message
-from magmav.mavlink.float32 import float32, same
+from magmav.mavlink.float32 import same
 from magmav.mavlink.values import cast, set_cast
 
-COMPASSES = (1, 2, 3)
 AXES = ("X", "Y", "Z")
 LEARN, OFFS_MAX, MOTCT = "COMPASS_LEARN", "COMPASS_OFFS_MAX", "COMPASS_MOTCT"
 # COMPASS_OFS_X, COMPASS_OFS2_X, COMPASS_OFS3_X, and the other naming scheme's COMPASS1_OFS_X and so on
@@ -103,14 +103,7 @@ class ArduPilot:
 
     def checked(self, change: Change) -> Change:
         """The same change in exact 32-bit floats. ValueError names what may not be written or does not fit."""
-        checked_shape(change)
-        for name in change.names:
-            if not _OFFSET.fullmatch(name):
-                raise ValueError(f"change: {name!r} is not a compass offset, and nothing else is ever written")
-        device = _DEVICE.fullmatch(change.device_name)
-        if device is None or {_whose(_OFFSET.fullmatch(name)) for name in change.names} != {_whose(device)}:
-            raise ValueError(f"change: {change.names!r} and {change.device_name!r} are not of one compass")
-        return exact(change)
+        return allowed(change, _OFFSET, _DEVICE)
 
     def triple(self, change: Change) -> tuple[str, str, str]:
         """All three offset names of this compass."""
@@ -147,24 +140,3 @@ class ArduPilot:
         if compass not in COMPASSES:
             raise ValueError(f"compass: want 1, 2 or 3, got {compass}")
         return _STREAMS[compass]
-
-
-def checked_shape(change: Change) -> None:
-    """ValueError where a change does not hang together, whatever it is for."""
-    sizes = {len(change.names), len(change.old), len(change.new), len(change.step_mg)}
-    if sizes - {1, 2, 3} or len(sizes) != 1:
-        raise ValueError("change: names, old, new and step_mg want the same length, 1 to 3")
-    if len(set(change.names)) != len(change.names):
-        raise ValueError(f"change: a name is there twice in {change.names!r}")
-    if change.compass not in COMPASSES:
-        raise ValueError(f"change: compass wants 1, 2 or 3, got {change.compass!r}")
-
-
-def exact(change: Change) -> Change:
-    """Old and new as exact 32-bit floats."""
-    return replace(change, old=tuple(map(float32, change.old)), new=tuple(map(float32, change.new)))
-
-
-def _whose(match: re.Match[str] | None) -> tuple[str | None, ...]:
-    """Number and scheme in a name."""
-    return () if match is None else match.groups()[:2]

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Mapping
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.core.types import Change
-from magmav.mavlink.autopilot.ardupilot_names import checked_shape, exact
+from magmav.mavlink.autopilot.allowed import allowed
 from magmav.mavlink.codec import Message
 from magmav.mavlink.float32 import same
 from magmav.mavlink.values import bytewise, set_bytewise
@@ -67,15 +67,7 @@ class Px4:
 
     def checked(self, change: Change) -> Change:
         """The same change in exact 32-bit floats. ValueError names what may not be written or does not fit."""
-        checked_shape(change)
-        for name in change.names:
-            if not _OFFSET.fullmatch(name):
-                raise ValueError(f"change: {name!r} is not a compass offset, and nothing else is ever written")
-        device = _DEVICE.fullmatch(change.device_name)
-        slots = {match.group(1) for name in change.names if (match := _OFFSET.fullmatch(name))}
-        if device is None or slots != {device.group(1)}:
-            raise ValueError(f"change: {change.names!r} and {change.device_name!r} are not of one compass")
-        return exact(change)
+        return allowed(change, _OFFSET, _DEVICE)
 
     def triple(self, change: Change) -> tuple[str, str, str]:
         """All three offset names of this slot."""
