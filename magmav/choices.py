@@ -25,18 +25,19 @@ _SECOND = 1_000_000_000
 _KNOBS = {f"{k.section}.{k.key}": k for k in knobs() if k.param}
 
 
-def beside(store: Path) -> Path:
-    """Where the choices of a service with this store are kept."""
-    return store.with_name(store.name + "-choices.json")
+def beside(store: Path, system: int) -> Path:
+    """Where the choices of this vehicle are kept, for everybody who works with this store."""
+    return store.with_name(f"{store.name}-choices-{system}.json")
 
 
 class Choices:
-    """The choices of one service. For one thread; it reads no clock, ``now_ns`` is the link's.
+    """The choices of one vehicle. For one thread; it reads no clock, ``now_ns`` is the link's.
 
+    path : None until the vehicle is known; what is chosen before waits.
     problem : why the last attempt to keep something failed, or "".
     """
 
-    def __init__(self, path: Path, configured: Settings) -> None:
+    def __init__(self, path: Path | None, configured: Settings) -> None:
         self.path = path
         self.problem = ""
         self._configured = configured
@@ -46,7 +47,9 @@ class Choices:
     def settings(self) -> Settings:
         """The configuration with the choices that hold. What cannot be read or used is left out, and logged."""
         settings = self._configured
-        for name, kept in self._read().items():
+        for name, kept in (self._read() | self._fresh).items():
+            if kept is None:
+                continue
             knob = _KNOBS.get(name)
             if knob is None:
                 _log.warning("%s: no setting called %s any more; left out", self.path, name)
@@ -75,7 +78,7 @@ class Choices:
 
     def keep(self) -> None:
         """Write what waits, now. A failure is logged and stays in ``problem``; what waits is tried again."""
-        if not self._fresh:
+        if not self._fresh or self.path is None:
             return
         try:
             held = self._read(strict=True) | self._fresh
@@ -95,8 +98,10 @@ class Choices:
             _log.warning("%s: %s; left out", self.path, error)
             return settings
 
-    def _read(self, *, strict: bool = False) -> dict[str, Any]:
+    def _read(self, *, strict: bool = False) -> dict[str, dict[str, Any] | None]:
         """name -> value and over; empty when there is none. ``strict``: ValueError on what a write would destroy."""
+        if self.path is None:
+            return {}
         try:
             text = self.path.read_bytes()
         except FileNotFoundError:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 
@@ -59,7 +58,8 @@ class MagCompanion:
     """Serves one vehicle. ``writer`` makes the writes.
 
     serves : False for one write of the caller's and nothing else, no trigger and no pending restore.
-    keyed : what we send is signed.  budget, choices : of its own unless given.
+    keyed : what we send is signed.  budget : of its own unless given.
+    What was chosen in flight for this vehicle counts as soon as it is known which one it is, see magmav.choices.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class MagCompanion:
         serves: bool = True,
         keyed: bool = False,
         budget: Budget | None = None,
-        choices: Path | None = None,
     ) -> None:
-        self._choices = Choices(choices or beside(store.path), settings)
+        named = settings.vehicle.system
+        self._choices = Choices(beside(store.path, named) if named else None, settings)
         self.settings = settings = self._choices.settings()
-        pipeline.apply(settings, settings.vehicle.system or None)
+        pipeline.apply(settings, named or None)
         self._asks_for: frozenset[str] | None = None if ask else frozenset()
         self._pipeline = pipeline
         self._store = store
@@ -92,6 +92,7 @@ class MagCompanion:
         self.budget = budget or Budget(settings.wire.budget_bps, signed=keyed)
         self._seal = Seal(keyed)
         self._said_sealed = False
+        self._taken_up = False
         self._source: tuple[int, str] | None = None
         self.presence = Presence(v.component, v.system or None, Manners(self.budget, files(own, __version__)))
         self._watch = Watch(self.presence)
@@ -111,6 +112,22 @@ class MagCompanion:
             serves=serves,
         )
         self._server = ParamServer(own, self.presence, self.budget, denied=self._denied)
+
+    def _take_up(self) -> None:
+        """The vehicle is known now, and with it what was chosen for it before."""
+        if self._taken_up or self.presence.autopilot is None:
+            return
+        self._taken_up = True
+        if self._choices.path is None:
+            self._choices.path = beside(self._store.path, self.presence.system)
+            self.settings = self._choices.settings()
+        self._hold_by(self.settings)
+
+    def _hold_by(self, settings: Settings) -> None:
+        self._pipeline.apply(settings, self.presence.system)
+        self.budget.rate(settings.wire.budget_bps)
+        self.announcer.rate(settings.wire.heading_hz)
+        self._intervals.want(self._rates())
 
     def ask_for(self, names: Iterable[str]) -> None:
         """Ask the vehicle for these messages only; whoever else asked for the others keeps them."""
@@ -138,6 +155,7 @@ class MagCompanion:
         self._seal.on_message(message, route)
         out = self.presence.on_message(message, route, now_ns)
         self._watch.on_message(message, route, now_ns)
+        self._take_up()
         self._begin_anew()
         if not self.sealed:
             for machine in (self._intervals, self._fetch):
@@ -208,6 +226,7 @@ class MagCompanion:
         self._tell_sealed(now_ns)
         out = [] if self.sealed and self.job is None else self.writer.poll(now_ns)
         out += self.presence.poll(now_ns)
+        self._take_up()
         self._begin_anew()
         if not self.sealed:
             if self.presence.autopilot is not None and self.presence.autopilot.kind != self.kind:
@@ -257,10 +276,7 @@ class MagCompanion:
             self._choices.chose(section, key, wanted, self._now_ns)
         if self._choices.problem:
             self.announcer.say(_WARNING, "MMAG choice not kept: see the log", self._now_ns)
-        self._pipeline.apply(self.settings, self.presence.system)
-        self.budget.rate(self.settings.wire.budget_bps)
-        self.announcer.rate(self.settings.wire.heading_hz)
-        self._intervals.want(self._rates())
+        self._hold_by(self.settings)
         return True
 
     def _denied(self, name: str, now_ns: int) -> None:

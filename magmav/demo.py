@@ -91,7 +91,8 @@ class Director:
         companion = self.session.companion
         if companion.ended is not None:
             job, companion.ended = companion.ended, None
-            done = outcome(job.change, job.result, job.reasons, int(companion.confirm))
+            above_mg = companion.settings.upload.confirm_above_mg
+            done = outcome(job.change, job.result, job.reasons, int(companion.confirm), above_mg)
             if self.act is Act.UPLOAD:
                 self.uploads.append(done)
             else:
@@ -123,7 +124,7 @@ class Director:
         if change is None or self.known[compass].verdict.state is not State.READY:
             why = "; ".join(r.text for r in self.known[compass].verdict.reasons)
             raise DemoError(f"compass {compass} is not ready after the first flight: {why}")
-        companion.confirm = float(code_needed(change) or 0)
+        companion.confirm = float(code_needed(change, companion.settings.upload.confirm_above_mg) or 0)
         companion.request_upload(compass, now_ns)
 
     def _start_mission(self, now_ns: int) -> None:

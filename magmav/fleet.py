@@ -131,7 +131,6 @@ class Fleet:
             self._unix_offset_ns,
             keyed=self._keyed,
             budget=self._budgets.setdefault(route, Budget(bps, signed=self._keyed)),
-            choices=self._store.path.with_name(f"{self._store.path.name}-choices-{system}.json"),
         )
         _log.warning("vehicle %d is heard", system)
 

@@ -13,7 +13,7 @@ from magmav.core.types import Change, FieldModel, Reason, UploadResult
 from magmav.dry import every_message
 from magmav.link import Link
 from magmav.mavlink.autopilot.ardupilot import offset_names
-from magmav.mavlink.change import code_needed, largest_step_mg
+from magmav.mavlink.change import CONFIRM_ABOVE_MG, code_needed, largest_step_mg
 from magmav.mavlink.signing import Signing
 from magmav.own_params import COMPASSES
 from magmav.pipeline import Pipeline
@@ -98,7 +98,8 @@ def transact(
             if stop():
                 break
             if companion.ended is not None:
-                return outcome(companion.ended.change, companion.ended.result, companion.ended.reasons, confirm)
+                job, above_mg = companion.ended, companion.settings.upload.confirm_above_mg
+                return outcome(job.change, job.result, job.reasons, confirm, above_mg)
             if companion.sealed and companion.job is None:
                 return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_SIGNED_READ_ONLY,))}
             ready = companion.writer.identified or companion.presence.autopilot is None
@@ -155,12 +156,18 @@ def _shown(session: Session, change: Change, rates: Sequence[str], *, undo: bool
     held = [] if flown is None else [name for c in COMPASSES for name in flown.calibrations.stored(c)]
     above_mg = session.companion.settings.upload.confirm_above_mg
     lines = every_message(change, rates, held, above_mg, undo=undo)
-    return outcome(change, None, (), None) | {"dry_run": True, "messages": lines}
+    return outcome(change, None, (), None, above_mg) | {"dry_run": True, "messages": lines}
 
 
-def outcome(change: Change, result: UploadResult | None, reasons: Sequence[Reason], confirm: int | None) -> Result:
-    """What a write did, as the JSON that the command prints."""
-    code = code_needed(change)
+def outcome(
+    change: Change,
+    result: UploadResult | None,
+    reasons: Sequence[Reason],
+    confirm: int | None,
+    above_mg: float = CONFIRM_ABOVE_MG,
+) -> Result:
+    """What a write did, as the JSON that the command prints. above_mg : larger changes want a code."""
+    code = code_needed(change, above_mg)
     return {
         "result": None if result is None else result.name,
         "reasons": _reasons(reasons),

@@ -24,7 +24,7 @@ ON_THE_WIRE = [k for k in knobs() if k.param]
 
 @pytest.fixture
 def path(tmp_path):
-    return beside(tmp_path / "magmav.sqlite")
+    return beside(tmp_path / "magmav.sqlite", 7)
 
 
 def held(path, configured=None):
@@ -32,7 +32,7 @@ def held(path, configured=None):
 
 
 def test_it_lies_beside_the_store(path):
-    assert path.name == "magmav.sqlite-choices.json"
+    assert path.name == "magmav.sqlite-choices-7.json"
     assert held(path) == Settings() or repr(held(path)) == repr(Settings())
 
 
@@ -141,7 +141,7 @@ def test_a_newer_format_is_left_alone(path):
 
 
 def test_a_disk_that_fails_is_said_tried_again_and_leaves_nothing_half(tmp_path):
-    path = beside(tmp_path / "gone" / "magmav.sqlite")
+    path = beside(tmp_path / "gone" / "magmav.sqlite", 7)
     choices = Choices(path, Settings())
     choices.chose("gate", "samples", 200, 0)
     assert "No such file" in choices.problem

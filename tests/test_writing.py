@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from magmav_sim import Simulation, parse_scenario
-from magmav_sim.link import SimulatedLink
+from magmav_sim.link import ROUTE, SimulatedLink
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scripted_vehicle import Vehicle
 from test_kept import Bench
 from test_store_format import SAVED, VERDICT
@@ -16,6 +19,7 @@ from upload_rig import NAMES, OLD, Rig, a_change, refused
 
 from magmav.cli import main
 from magmav.core.types import Change, Reason, UploadResult
+from magmav.link import Packet
 from magmav.store import SavedEstimate, Store
 
 
@@ -91,3 +95,61 @@ def test_S19_what_was_learnt_on_another_vehicle_is_not_uploaded_to_this_one(
     else:
         assert (code, out["result"], held) == (1, "REFUSED", (0.0, 0.0, 0.0))
         assert [r["code"] for r in out["reasons"]] == ["NO_CALIBRATION"]
+
+
+class _Asked:
+    """The simulated vehicle's link, over which a ground station sets one of our parameters every second."""
+
+    def __init__(self, simulation: Simulation, until_s: float, name: bytes, value: float) -> None:
+        self._link = SimulatedLink(simulation, until_s=until_s)
+        self.name, self.datagrams, self.warning = self._link.name, self._link.datagrams, ""
+        self.unix_offset_ns, self.counts = self._link.unix_offset_ns, self._link.counts
+        ground = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._frame = dialect.MAVLink_param_set_message(1, 191, name, value, 9).pack(ground)
+
+    def packets(self) -> Iterator[Packet]:
+        next_ns = 0
+        for packet in self._link.packets():
+            yield packet
+            if packet.t_ns >= next_ns:
+                next_ns = packet.t_ns + 1_000_000_000
+                yield Packet(packet.t_ns, self._frame, ROUTE)
+
+    def send(self, data: bytes, route: str = "") -> None:
+        self._link.send(data, route)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+def test_what_was_chosen_in_flight_counts_for_upload_too_until_the_configuration_says_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`magmav run` is told by MMAG_CONF_ABOVE that 50 mG want a code; `magmav upload` of 100 mG then wants one."""
+    simulation = Simulation(parse_scenario(GROUND, "ground.toml"), 3)
+    path, mine = tmp_path / "s.sqlite", tmp_path / "mine.toml"
+    new = (-100.0, 50.0, -60.0)
+    change = Change(1, 1, "COMPASS_DEV_ID", 97539, NAMES, (0.0,) * 3, new, new, (2.0,) * 3, tuple(map(abs, new)))
+    with Store(path) as store:
+        store.save_estimate(SavedEstimate(7, "1", change, VERDICT, SAVED.offsets_mg, SAVED.sigma_mg))
+
+    monkeypatch.setattr("magmav.link.many.open_links", lambda texts: _Asked(simulation, 20.0, b"MMAG_CONF_ABOVE", 50.0))
+    assert main(["run", "udpin:127.0.0.1:0", "--store", str(path)]) == 0
+
+    def told(command: str, *words: str) -> tuple[int, dict[str, Any]]:
+        until_s = simulation.elapsed_ns / 1e9 + 90.0
+        monkeypatch.setattr("magmav.link.open.open_link", lambda text: SimulatedLink(simulation, until_s=until_s))
+        capsys.readouterr()
+        code = main([command, "udpin:127.0.0.1:0", "--store", str(path), "--json", *words])
+        return code, json.loads(capsys.readouterr().out)
+
+    code, refused_ = told("upload")
+    assert (code, refused_["result"]) == (1, "REFUSED")
+    assert [r["code"] for r in refused_["reasons"]] == ["CONFIRM_CHANGE"]
+    code, dry = told("upload", "--dry-run", "--system", "1")
+    assert (code, dry["confirm_code"]) == (0, refused_["confirm_code"]) and dry["confirm_code"] is not None
+    mine.write_text("[upload]\nconfirm_above_mg = 120.0\n")  # edited later: the latest word counts
+    assert told("upload", "--config", str(mine), "--dry-run")[1]["confirm_code"] is None
+    code, done = told("upload", "--confirm-change", str(dry["confirm_code"]))
+    assert (code, done["result"], done["confirmed"]) == (0, "ALL_NEW", True)
+    assert told("restore")[1]["result"] == "ALL_OLD"
