@@ -81,6 +81,7 @@ class Vehicle:
         self.delivered: list[tuple[int, Any, str]] = []  # what reached us
         self.at: list[tuple[int, Callable[[], None]]] = []
         self.on_set: Callable[[str], None] = lambda name: None
+        self.on_interval: Callable[[int, float], bool] = lambda message_id, interval_us: False  # whether it obeys
         self._wire = Wire()
         self._queue: list[tuple[int, int, str, Any]] = []
         self._count = 0
@@ -143,11 +144,13 @@ class Vehicle:
         return dialect.MAVLink_raw_imu_message(self.now_ns // 1000, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
 
     def _command(self, message: Any) -> None:
-        """MAV_CMD_RUN_PREARM_CHECKS is all it knows: acknowledged, and a text for what would not pass."""
-        mine = message.command == dialect.MAV_CMD_RUN_PREARM_CHECKS and self.knows_prearm_checks
+        """MAV_CMD_RUN_PREARM_CHECKS: acknowledged, and a text for what would not pass. Intervals: see on_interval."""
+        checks = message.command == dialect.MAV_CMD_RUN_PREARM_CHECKS and self.knows_prearm_checks
+        interval = message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+        mine = checks or (interval and self.on_interval(round(message.param1), message.param2))
         result = dialect.MAV_RESULT_ACCEPTED if mine else dialect.MAV_RESULT_UNSUPPORTED
         self.say(dialect.MAVLink_command_ack_message(message.command, result, 0, 0, self.system, 191))
-        if mine and not self.committed:
+        if checks and not self.committed:
             self.say(dialect.MAVLink_statustext_message(2, b"PreArm: Compass not calibrated"))
 
     def heartbeat(self, armed: bool | None = None) -> Any:

@@ -27,7 +27,8 @@ class Bench:
         self.asked: list[tuple[float, int, float]] = []  # seconds, message id, interval in us
         self.rate_hz: dict[str, float] = {}
         self.answers: dict[int, int] = {}  # message id -> result; missing is ACCEPTED, -1 is silence
-        self.others_ack = False
+        self.twice = False  # every answer comes doubled
+        self._acks: list[Any] = []  # on their way
 
     def hear(self, message: Any, component: int = 1, route: str = "a") -> Any:
         carried = WIRE.carry(message, 1, component)
@@ -36,6 +37,9 @@ class Bench:
 
     def run(self, seconds: float) -> None:
         for tick in range(round(seconds * 50)):
+            acks, self._acks = self._acks, []
+            for ack in acks:
+                self.take(self.machine.on_message(WIRE.carry(ack, 1, 1), "a", self.now_ns))
             self.take(self.machine.poll(self.now_ns))
             for name, hz in self.rate_hz.items():
                 if hz and tick % round(50 / hz) == 0:
@@ -52,7 +56,7 @@ class Bench:
             result = self.answers.get(round(m.param1), 0)
             if result >= 0:
                 ack = dialect.MAVLink_command_ack_message(511, result, 0, 0, 1, 191)
-                self.take(self.machine.on_message(WIRE.carry(ack, 1, 1), "a", self.now_ns))
+                self._acks += [ack] * (1 + self.twice)
 
 
 def test_each_is_asked_once_with_its_interval() -> None:
@@ -83,13 +87,51 @@ def test_an_answer_to_somebody_else_frees_nothing() -> None:
     assert [i for _, i, _ in bench.asked] == [RAW_IMU]
 
 
-def test_denied_is_remembered() -> None:
+def test_denied_is_asked_once_more_alone_and_then_remembered() -> None:
     bench = Bench({"HIGHRES_IMU": 10.0, "ATTITUDE": 10.0})
     bench.answers = {HIGHRES_IMU: dialect.MAV_RESULT_DENIED}
     bench.rate_hz = {"ATTITUDE": 10.0}
-    bench.run(120.0)
-    assert [i for _, i, _ in bench.asked] == [HIGHRES_IMU, ATTITUDE]
+    bench.run(600.0)
+    assert [i for _, i, _ in bench.asked] == [HIGHRES_IMU, ATTITUDE, HIGHRES_IMU]
+    assert bench.asked[2][0] - bench.asked[0][0] >= 10.0
     assert bench.machine.refused == {"HIGHRES_IMU"}
+
+
+def test_a_refusal_that_was_another_messages_is_not_believed_for_good() -> None:
+    """The answer says not which message it is about: doubled, it is taken for that of the next request."""
+    bench = Bench({"HIGHRES_IMU": 10.0, "ATTITUDE": 10.0, "RAW_IMU": 10.0})
+    bench.answers = {HIGHRES_IMU: dialect.MAV_RESULT_DENIED, ATTITUDE: -1}  # the request for ATTITUDE is lost
+    bench.twice = True
+    bench.rate_hz = {"RAW_IMU": 10.0}
+    bench.run(1.0)
+    assert [i for _, i, _ in bench.asked] == [HIGHRES_IMU, ATTITUDE, RAW_IMU]
+    del bench.answers[ATTITUDE]
+    bench.run(40.0)
+    again = [i for _, i, _ in bench.asked[3:]]
+    assert again.count(HIGHRES_IMU) == 1 and ATTITUDE in again
+    assert bench.machine.refused == {"HIGHRES_IMU"}
+
+
+def test_streams_that_end_are_asked_for_again_whatever_was_answered_once() -> None:
+    """A reboot that nothing shows, since all that carries the boot clock ended with it."""
+    bench = Bench({"HIGHRES_IMU": 10.0, "ATTITUDE": 10.0, "RAW_IMU": 10.0})
+    bench.answers = {HIGHRES_IMU: dialect.MAV_RESULT_DENIED}
+    bench.twice = True
+    bench.rate_hz = {"ATTITUDE": 10.0, "RAW_IMU": 10.0}
+    bench.run(60.0)
+    count = len(bench.asked)
+    bench.rate_hz = {}
+    bench.run(30.0)
+    assert {i for _, i, _ in bench.asked[count:]} == {ATTITUDE, RAW_IMU}
+
+
+def test_S14_what_was_refused_by_mistake_and_came_is_given_back_too() -> None:
+    bench = Bench({"HIGHRES_IMU": 10.0, "ATTITUDE": 10.0})
+    bench.answers = {HIGHRES_IMU: dialect.MAV_RESULT_DENIED}
+    bench.twice = True
+    bench.rate_hz = {"ATTITUDE": 10.0}
+    bench.run(60.0)
+    assert [round(o.message.param1) for o in bench.machine.restore()] == [ATTITUDE]
 
 
 def test_AT_9b_a_rate_that_drops_is_asked_for_again_ever_more_rarely() -> None:

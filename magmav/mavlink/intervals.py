@@ -1,7 +1,9 @@
 """Ask the autopilot for the messages we live on, at the rate we need, and give them back when we leave.
 
-The answer (COMMAND_ACK) does not say which message it is about, so requests go out one at a time. ArduPilot
-applies an interval to the channel the command came in on, so a new route or a reboot starts everything over.
+The answer (COMMAND_ACK) does not say which message it is about, so requests go out one at a time. Even so a doubled
+or late answer can be taken for that of the next request. So a refusal is no last word: what does not come is asked for
+once more, with nothing else asked for five seconds before, and only that answer stands. ArduPilot applies an interval
+to the channel the command came in on, so a new route or a reboot starts everything over.
 """
 
 from __future__ import annotations
@@ -36,8 +38,13 @@ class _Stream:
     next_ns: int = 0  # no request before
     asked_ns: int = -FIRST_PAUSE_NS  # the last request
     pause_ns: int = FIRST_PAUSE_NS
-    refused: bool = False
+    refusals: int = 0  # the second one was given to a request that stood alone
+    came: bool = False
     changed: bool = False  # we sent at least one request
+
+    @property
+    def refused(self) -> bool:
+        return self.refusals > 1
 
 
 class Intervals:
@@ -83,7 +90,7 @@ class Intervals:
 
     @property
     def refused(self) -> frozenset[str]:
-        """Messages the autopilot said it does not have."""
+        """Messages the autopilot said twice it does not have."""
         return frozenset(name for name, stream in self._streams.items() if stream.refused)
 
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
@@ -95,9 +102,10 @@ class Intervals:
         kind = message.get_type()
         if kind in self._streams:
             self._streams[kind].count += 1
+            self._streams[kind].came = True
         elif kind == "COMMAND_ACK" and self._waiting and self._is_ours(message):
             stream = self._streams[self._waiting]
-            stream.refused = message.result in _REFUSED
+            stream.refusals = stream.refusals + 1 if message.result in _REFUSED else 0
             self._waiting = ""
         return self.poll(now_ns)
 
@@ -113,12 +121,13 @@ class Intervals:
             self._key = key
         self._measure(now_ns)
         if self._waiting:
-            if now_ns - self._sent_ns < ACK_NS:
+            alone = self._streams[self._waiting].refusals > 0
+            if now_ns - self._sent_ns < (WINDOW_NS if alone else ACK_NS):
                 return []
             if self._streams[self._waiting].tries < TRIES:
                 self._queue.appendleft(self._waiting)
             self._waiting = ""
-        name = next((n for n in self._queue if self._streams[n].tries or now_ns >= self._streams[n].next_ns), None)
+        name = next((n for n in self._queue if self._may_ask(self._streams[n], now_ns)), None)
         if name is None:
             return []
         self._queue.remove(name)
@@ -129,10 +138,15 @@ class Intervals:
         autopilot = self._presence.autopilot
         if autopilot is None:
             return []
-        changed = [name for name, stream in self._streams.items() if stream.changed and not stream.refused]
+        changed = [n for n, stream in self._streams.items() if stream.changed and (stream.came or not stream.refusals)]
         for name in changed:
             self._streams[name].changed = False
         return [_command(autopilot, name, 0) for name in changed]
+
+    def _may_ask(self, stream: _Stream, now_ns: int) -> bool:
+        if stream.refusals and now_ns - self._sent_ns < WINDOW_NS:
+            return False
+        return stream.tries > 0 or now_ns >= stream.next_ns
 
     def _request(self, autopilot: Autopilot, name: str, now_ns: int) -> Outgoing:
         stream = self._streams[name]
