@@ -298,6 +298,37 @@ def test_S2_no_record_no_write() -> None:
     refused(rig, Reason.BUSY)
 
 
+@pytest.mark.parametrize("late_ms", [1000, 2000, 3000, 4000])
+def test_S1_a_write_that_landed_after_arming_is_no_success_however_late_the_heartbeat_says_so(late_ms: int) -> None:
+    """Heartbeats from before come late, those that say armed are lost for a while: all is read back and proven first."""
+    rig = Rig()
+    vehicle = rig.vehicle
+
+    def arm(name: str) -> None:
+        vehicle.on_set = lambda name: None
+        vehicle.heartbeats, vehicle.armed = False, True
+        for after_ms in (300, 900):  # on their way since before
+            vehicle.at.append((vehicle.now_ns + after_ms * MS, lambda: vehicle.say(vehicle.heartbeat(armed=False))))
+        vehicle.at.append((vehicle.now_ns + late_ms * MS, lambda: setattr(vehicle, "heartbeats", True)))
+
+    vehicle.on_set = arm
+    upload = rig.go()
+    assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.ARMED,))
+    assert rig.journal.ended == [(7, UploadResult.PENDING_RESTORE, (Reason.ARMED,))]
+    rig.check_S1()
+
+
+@pytest.mark.parametrize("undoes", [None, 7])
+def test_S1_nothing_is_called_done_before_a_heartbeat_that_left_after_the_last_write(undoes: int | None) -> None:
+    rig = Rig()
+    rig.vehicle.on_set = lambda name: setattr(rig.vehicle, "heartbeats", False)
+    if undoes:
+        rig.vehicle.params |= dict(zip(NAMES, a_change().new, strict=True))
+        rig.vehicle.applied |= rig.vehicle.params
+    upload = rig.go(undoes=undoes)
+    assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.LINK_LOST,))
+
+
 def test_S3_armed_between_write_one_and_two_stops_and_says_so() -> None:
     rig = Rig()
     vehicle = rig.vehicle
@@ -419,7 +450,7 @@ def test_heartbeats_alone_missing_stop_the_writing_after_their_age() -> None:
 def test_a_reboot_midway_is_pending() -> None:
     rig = Rig()
     rig.vehicle.speed_cms = 0
-    rig.vehicle.on_set = lambda name: rig.vehicle.say(dialect.MAVLink_system_time_message(0, 50))
+    rig.vehicle.on_set = lambda name: rig.vehicle.clock(50)
     upload = rig.go()
     assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.LINK_LOST,))
 

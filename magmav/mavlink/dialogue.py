@@ -15,16 +15,21 @@ from magmav.mavlink.float32 import same
 class Dialogue:
     """stored : values as last heard, by name; a name just written is not known until it is heard again.
 
-    names : only these are listened to.  wrote : at least one PARAM_SET was made.
+    names : only these are listened to.  wrote_ns : when the last PARAM_SET was made.
     """
 
     def __init__(self, adapter: Adapter, pin: tuple[int, int, str], names: Iterable[str]) -> None:
         self.stored: dict[str, float] = {}
-        self.wrote = False
+        self.wrote_ns: int | None = None
         self.asking = Exchange((), 0, 0)
         self._adapter = adapter
         self._pin = pin
         self._names = frozenset(names)
+
+    @property
+    def wrote(self) -> bool:
+        """At least one PARAM_SET was made."""
+        return self.wrote_ns is not None
 
     def turn_to(self, names: Iterable[str], retry_ns: int, tries: int) -> None:
         """From now on these names are open."""
@@ -54,7 +59,7 @@ class Dialogue:
         for name in self.asking.due(now_ns):
             self.asking.asked(name, now_ns)
             self.stored.pop(name, None)
-            self.wrote = True
+            self.wrote_ns = now_ns
             kind = dialect.MAV_PARAM_TYPE_REAL32
             out.append(self._to(self._adapter.set_message(*self._pin[:2], name, values[name], kind)))
         return out

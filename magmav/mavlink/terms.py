@@ -46,6 +46,7 @@ class UploadSettings:
     settle_ns: int = 500 * _MS
     proof_ns: int = 6000 * _MS
     linger_ns: int = 4500 * _MS  # a delayed copy of an earlier write, and its echo, have arrived by then
+    seen_out_ns: int = 5000 * _MS  # heard so late, a heartbeat left the vehicle after the last write had landed
     silent_ns: int = 5000 * _MS  # nothing at all from the autopilot
     heartbeat_lost_ns: int = 10_000 * _MS
     whole_ns: int = 180_000 * _MS
@@ -62,5 +63,6 @@ class Phase(Enum):
     READ_BACK = "reading back"
     SETTLE = "letting the compass settle"
     PROOF = "checking that the field moved as predicted"
+    SEEN_OUT = "waiting for a heartbeat after the last write"
     ARMING = "asking the autopilot whether it would arm"
     DONE = "done"

@@ -1,12 +1,13 @@
 """Writing offsets to an autopilot as a transaction, and taking them back: all new, all old, never in between.
 
-    PREFLIGHT -> BASELINE -> (on record) -> WRITE -> READ_BACK -> SETTLE -> PROOF -> ARMING -> DONE
+    PREFLIGHT -> BASELINE -> (on record) -> WRITE -> READ_BACK -> SETTLE -> PROOF -> SEEN_OUT -> ARMING -> DONE
                                               ^  \\________ retreat ________/
-                                              '-> LINGER -> READ_BACK
+                                              '-> LINGER -> READ_BACK -> SEEN_OUT
 
 One vector goes out back to back, right after a heartbeat that says disarmed. No autopilot writes it at once, so a
 record on disk comes first, every name is read back, and the corrected stream has to move as predicted; otherwise the
-old values are written back with the same care. Where no stream shows it (PX4), BASELINE and PROOF fall away and the
+old values are written back with the same care. What is heard may be old: only a heartbeat long after the last write
+shows that the vehicle had not armed before it landed (S1). Where no stream shows it (PX4), BASELINE and PROOF fall away and the
 end is WRITTEN_UNPROVEN. Whatever happens in between that forbids writing (the vehicle arms, the link is lost) stops
 everything at once: PENDING_RESTORE, to be undone at the next disarm by an Upload with ``undoes``. Every wait is
 bounded, so the machine always ends.
@@ -80,6 +81,7 @@ class Upload:
             Phase.READ_BACK: self._read_back,
             Phase.SETTLE: self._settle,
             Phase.PROOF: self._proof,
+            Phase.SEEN_OUT: self._seen_out,
             Phase.ARMING: self._arming,
         }
         self._against = against
@@ -331,7 +333,17 @@ class Upload:
             self._enter(Phase.WRITE, now_ns)
 
     def _arrive(self, now_ns: int) -> None:
-        """Everything read back as it should be. New values still have to please the autopilot's own checks."""
+        """Everything read back as it should be."""
+        self._enter(Phase.SEEN_OUT, now_ns)
+
+    def _seen_out(self, now_ns: int) -> None:
+        """Said to be done when it is known that no write landed on an armed vehicle. Whoever is silent is lost."""
+        wrote_ns, heard_ns = self._talk.wrote_ns, self._watch.heartbeat_ns
+        if wrote_ns is None or (heard_ns is not None and heard_ns - wrote_ns >= self._set.seen_out_ns):
+            self._done(now_ns)
+
+    def _done(self, now_ns: int) -> None:
+        """New values still have to please the autopilot's own checks."""
         if self._target is self._old:
             self._end(UploadResult.ALL_OLD)
         elif not self._streams:
@@ -345,7 +357,7 @@ class Upload:
     def _arming(self, now_ns: int) -> None:
         check = self._arming_check
         if check is None or self._ending is None:
-            raise AssertionError("ARMING is entered by _arrive")
+            raise AssertionError("ARMING is entered by _done")
         if not check.done(now_ns) and not stop_reasons(self._watch, self._pin, self._boots, now_ns):
             self._out += check.poll(now_ns)
         else:
