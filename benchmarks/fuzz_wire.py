@@ -12,7 +12,8 @@ each a fifth of the bytes:
     stream    as armed, but a byte stream: rubbish between, and in the middle of, the vehicle's own frames
     flood     whole frames for our component only: parameters, commands, files, pings, as fast as they come
 
-One row each; 1 when anything raised, a PARAM_SET left us unasked, a parameter of the vehicle changed, or memory grew.
+One row each, of what there is when it is cut short (SIGTERM); 1 when anything raised, a PARAM_SET left us unasked, a
+parameter of the vehicle changed, or memory grew.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import gc
 import math
 import os
 import random
+import signal
 import struct
 import sys
 import time
@@ -29,6 +31,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -203,6 +206,7 @@ class Turn:
     changed: dict[str, float] = field(default_factory=dict)
     ends: Counter[str] = field(default_factory=Counter)
     raised: list[str] = field(default_factory=list)
+    cut: bool = False
     blocks: list[int] = field(default_factory=list)  # that Python holds, after each tenth
     rss_mb: list[float] = field(default_factory=list)
     seconds: float = 0.0
@@ -210,8 +214,8 @@ class Turn:
 
     @property
     def growth(self) -> float:
-        """Blocks at the end over those in the middle, where every table is warm, as a share."""
-        return self.blocks[-1] / self.blocks[len(self.blocks) // 2] - 1.0 if self.blocks else 0.0
+        """Blocks at the end over those in the middle, where every table is warm, as a share; 0 of a turn cut short."""
+        return self.blocks[-1] / self.blocks[len(self.blocks) // 2] - 1.0 if self.blocks and not self.cut else 0.0
 
     @property
     def wrong(self) -> bool:
@@ -305,14 +309,34 @@ class Fuzz:
         turn.simulated_s = (crew.vehicle.now_ns - self._begun_ns) / S
 
 
+_stop: Event | None = None  # of this worker's pool
+
+
+def begin_worker(stop: Event) -> None:
+    """A worker ends its turn when it is told to, not when the whole group is signalled."""
+    global _stop
+    _stop = stop
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _cut() -> bool:
+    return _stop is not None and _stop.is_set()
+
+
 def run(name: str, size: int, seed: int) -> Turn:
-    """One turn of so many bytes."""
+    """One turn of so many bytes, or of what there was time for."""
+    if _cut():
+        return Turn(name, cut=True)
     with TemporaryDirectory() as folder, Store(Path(folder) / "fuzz.sqlite") as store:
         fuzz = Fuzz(name, seed, store)
         fuzz.begin()
         begun, turn = time.process_time(), fuzz.turn
         mark = size / 10
         while turn.bytes_in < size:
+            if _cut():
+                turn.cut = True
+                break
             fuzz.step()
             if turn.bytes_in >= mark * (len(turn.blocks) + 1):
                 gc.collect()
@@ -331,9 +355,10 @@ def _rss_mb() -> float:
         return 0.0
 
 
-def table(turns: list[Turn]) -> Table:
+def table(turns: list[Turn], short: bool = False) -> Table:
     """A row for each turn and one for all."""
-    out = Table(title=f"{sum(t.bytes_in for t in turns)} bytes of mutated MAVLink")
+    cut = ", cut short" if short else ""
+    out = Table(title=f"{sum(t.bytes_in for t in turns)} bytes of mutated MAVLink{cut}")
     heads = ("turn", "bytes", "frames", "simulated s", "cpu s", "bytes answered", "raised", "forbidden PARAM_SETs")
     for head in (*heads, "vehicle parameters changed", "uploads asked for", "Python blocks at 10, 50, 100 %", "RSS MB"):
         out.add_column(head, justify="left" if head in ("turn", "uploads asked for") else "right")
@@ -351,12 +376,17 @@ def main(argv: list[str]) -> int:
     """Run every turn, print the table; 1 when something happened that must not."""
     size, seed, workers = (int(v) for v in (*argv, *("10000000", "1", f"{os.cpu_count() or 1}")[len(argv) :]))
     # A process for each turn, so that the memory of each is its own.
-    with ProcessPoolExecutor(workers, get_context("spawn"), max_tasks_per_child=1) as pool:
+    spawn = get_context("spawn")
+    stop = spawn.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    with ProcessPoolExecutor(workers, spawn, begin_worker, (stop,), max_tasks_per_child=1) as pool:
         tasks = [pool.submit(run, name, size // len(TURNS), seed) for name in TURNS]
         done = track(as_completed(tasks), "turns", len(tasks), console=Console(stderr=True))
         turns = sorted((task.result() for task in done), key=lambda t: TURNS.index(t.name))
+    turns = [turn for turn in turns if turn.frames or not turn.cut]
     out = Console(width=200)
-    out.print(table(turns))
+    out.print(table(turns, stop.is_set()))
     for turn in turns:
         for text in turn.raised[:5]:
             out.print(f"{turn.name}: {text}", markup=False)

@@ -300,7 +300,7 @@ def test_S2_no_record_no_write() -> None:
 
 @pytest.mark.parametrize("late_ms", [1000, 2000, 3000, 4000])
 def test_S1_a_write_that_landed_after_arming_is_no_success_however_late_the_heartbeat_says_so(late_ms: int) -> None:
-    """Heartbeats from before come late, those that say armed are lost for a while: all is read back and proven first."""
+    """Heartbeats from before come late, those that say armed are lost for a while: all is proven first."""
     rig = Rig()
     vehicle = rig.vehicle
 

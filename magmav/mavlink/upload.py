@@ -7,10 +7,10 @@
 One vector goes out back to back, right after a heartbeat that says disarmed. No autopilot writes it at once, so a
 record on disk comes first, every name is read back, and the corrected stream has to move as predicted; otherwise the
 old values are written back with the same care. What is heard may be old: only a heartbeat long after the last write
-shows that the vehicle had not armed before it landed (S1). Where no stream shows it (PX4), BASELINE and PROOF fall away and the
-end is WRITTEN_UNPROVEN. Whatever happens in between that forbids writing (the vehicle arms, the link is lost) stops
-everything at once: PENDING_RESTORE, to be undone at the next disarm by an Upload with ``undoes``. Every wait is
-bounded, so the machine always ends.
+shows that the vehicle had not armed before it landed (S1). Where no stream shows it (PX4), BASELINE and PROOF fall
+away and the end is WRITTEN_UNPROVEN. Whatever happens in between that forbids writing (the vehicle arms, the link is
+lost) stops everything at once: PENDING_RESTORE, to be undone at the next disarm by an Upload with ``undoes``. Every
+wait is bounded, so the machine always ends.
 
 Results are named by what the vehicle then holds: ALL_NEW, WRITTEN_UNPROVEN or ALL_OLD as read back, in terms of the
 change, for an undo too (an undo that works ends ALL_OLD). REFUSED: nothing was sent.
