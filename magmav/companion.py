@@ -93,6 +93,7 @@ class MagCompanion:
         self._seal = Seal(keyed)
         self._said_sealed = False
         self._taken_up = False
+        self._boots = self._known_boots = 0
         self._source: tuple[int, str] | None = None
         self.presence = Presence(v.component, v.system or None, Manners(self.budget, files(own, __version__)))
         self._watch = Watch(self.presence)
@@ -157,6 +158,7 @@ class MagCompanion:
         self._watch.on_message(message, route, now_ns)
         self._take_up()
         self._begin_anew()
+        self._after_reboot()
         if not self.sealed:
             for machine in (self._intervals, self._fetch):
                 out += machine.on_message(message, route, now_ns)
@@ -187,6 +189,19 @@ class MagCompanion:
                 kept.clear()
             self._fetch.restart()
         self._source = source
+
+    def _after_reboot(self) -> None:
+        """What was learnt and read goes before anything is read again: the other way round it would be lost."""
+        clock, flown = self.presence.clock, self.flown()
+        if clock.boots != self._boots and clock.ms is not None:
+            self._boots = clock.boots
+            _log.warning("system %d has rebooted", self.presence.system)
+            if flown is not None:
+                flown.rebooted(clock.ms * 1_000_000)
+        known = 0 if flown is None else flown.assembler.reboots
+        if known != self._known_boots:
+            self._known_boots = known
+            self._fetch.restart()  # readings may show it sooner
 
     def _suit(self) -> None:
         """Ask for the parameters and messages this autopilot has, by the names it answers to."""

@@ -115,6 +115,11 @@ class Vehicle:
         for channel in self.channels.values():
             channel.limits, channel.steady_s = limits(settings), settings.gate.steady_s
 
+    def rebooted(self, boot_ns: int) -> None:
+        """Its clock shows boot_ns since a reboot, as messages tell that give no reading."""
+        self.assembler.rebooted(boot_ns)
+        self._after_reboot()
+
     def step(self, r: Reading, t_ns: int, unix_ns: int) -> Record | None:
         """Hand one reading to whom it concerns."""
         match r:

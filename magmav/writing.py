@@ -71,7 +71,6 @@ class Writer:
         self._restoring: int | None = None
         self._left_alone: set[int] = set()
         self._uid = Uid(watch.presence)
-        self._boot_ms: int | None = None
         self._kept: dict[int, tuple[Write, Kept]] = {}  # by device id
         self._looked_for = ""  # the vehicle whose earlier writes were looked up
 
@@ -165,10 +164,6 @@ class Writer:
 
     def on_message(self, message: Message, route: str, now_ns: int) -> list[Outgoing]:
         """For the write under way."""
-        autopilot = self._presence.autopilot
-        sender = message.get_srcSystem(), message.get_srcComponent(), route
-        if autopilot is not None and sender == autopilot.pin:
-            self._boot_ms = getattr(message, "time_boot_ms", self._boot_ms)
         self._uid.on_message(message, route)
         for _, kept in self._kept.values():
             kept.on_message(message, route, now_ns)
@@ -248,10 +243,11 @@ class Writer:
         if job.row is None:
             return
         self._kept.pop(job.change.device_id, None)  # what an earlier write left is not there any more
-        if self._boot_ms is None or job.result not in _WHOLE:
+        boot_ms = self._presence.clock.ms
+        if boot_ms is None or job.result not in _WHOLE:
             return
         try:
-            self._store.ended_at(job.row, self._boot_ms)
+            self._store.ended_at(job.row, boot_ms)
             rows = self._store.unchecked(self._presence.system)
         except StoreError as error:
             _log.error("%s", error)

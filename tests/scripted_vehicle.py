@@ -48,6 +48,7 @@ class Vehicle:
     def __init__(self, seed: int = 0) -> None:
         self.random = random.Random(seed)
         self.now_ns = 100 * S
+        self.booted_ns = 0
         self.route = "udp:1"
         self.system, self.component = 1, 1
         self.params: dict[str, float] = {
@@ -85,6 +86,16 @@ class Vehicle:
         self._wire = Wire()
         self._queue: list[tuple[int, int, str, Any]] = []
         self._count = 0
+
+    @property
+    def boot_ms(self) -> int:
+        """Its own clock."""
+        return (self.now_ns - self.booted_ns) // MS
+
+    def clock(self, boot_ms: int) -> None:
+        """From now on its clock goes on from here, and it says so."""
+        self.booted_ns = self.now_ns - boot_ms * MS
+        self.say(dialect.MAVLink_system_time_message(0, boot_ms))
 
     def _later(self, where: str, message: Any) -> None:
         copies = 1 + (self.random.random() < self.duplicate)
@@ -141,7 +152,7 @@ class Vehicle:
             math.trunc(b + self.applied[f"COMPASS_OFS_{axis}"] + self.random.gauss(0, self.noise_mg))
             for b, axis in zip(self.field, "XYZ", strict=True)
         ]
-        return dialect.MAVLink_raw_imu_message(self.now_ns // 1000, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
+        return dialect.MAVLink_raw_imu_message(self.boot_ms * 1000, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
 
     def _command(self, message: Any) -> None:
         """MAV_CMD_RUN_PREARM_CHECKS: acknowledged, and a text for what would not pass. Intervals: see on_interval."""
@@ -163,8 +174,7 @@ class Vehicle:
         if tick % 25 == 0 and self.landed_state is not None:
             self.say(dialect.MAVLink_extended_sys_state_message(0, self.landed_state))
         if tick % 25 == 10 and self.speed_cms is not None:
-            boot = (self.now_ns // MS) & 0xFFFFFFFF
-            self.say(dialect.MAVLink_global_position_int_message(boot, 0, 0, 0, 0, self.speed_cms, 0, 0, 0))
+            self.say(dialect.MAVLink_global_position_int_message(self.boot_ms, 0, 0, 0, 0, self.speed_cms, 0, 0, 0))
         if tick % 50 == 7 and self.calibrating:
             self.say(dialect.MAVLink_mag_cal_progress_message(0, 1, 2, 1, 30, [0] * 10, 0, 0, 0))
         if tick % 5 == 0 and self.streams:
@@ -221,7 +231,7 @@ class Px4Vehicle(Vehicle):
 
     def _imu(self) -> Any:
         mag = [round(b + self.random.gauss(0, self.noise_mg)) for b in self.field]
-        return dialect.MAVLink_scaled_imu_message((self.now_ns // MS) % 2**32, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
+        return dialect.MAVLink_scaled_imu_message(self.boot_ms, 0, 0, -1000, self.gyro_mrads, 0, 0, *mag)
 
     def _value_in(self, message: Any) -> float:
         raw = message.get_msgbuf()[10:14]

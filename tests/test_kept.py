@@ -41,10 +41,6 @@ class Watched:
         return self.kept.poll(now_ns)
 
 
-def clock(vehicle: Vehicle, boot_ms: int) -> None:
-    vehicle.say(dialect.MAVLink_system_time_message(0, boot_ms))
-
-
 @pytest.mark.parametrize(
     ("after", "found"),
     [
@@ -60,16 +56,14 @@ def test_AT_4c_persisted_lost_or_changed(after: dict[str, float], found: Keeping
     rig = Rig(3, loss=loss)
     rig.vehicle.params.update(NEW)
     rig.vehicle.loss = 0.0
+    rig.vehicle.clock(600_000)
+    rig.vehicle.run(None, 1.0, rig.feed)
     watched = Watched(rig, boot_ms=600_000)
-    clock(rig.vehicle, 610_000)
     rig.vehicle.run(watched, 8.0, rig.feed)
     assert watched.kept.found is None and not rig.vehicle.sent, "nothing is asked before it has rebooted"
     rig.vehicle.params.update(after)
-    clock(rig.vehicle, 4_000)
-    rig.vehicle.run(None, 0.2, rig.feed)
-    rig.vehicle.at.append((rig.vehicle.now_ns + 200 * MS, lambda: clock(rig.vehicle, 5_000)))
+    rig.vehicle.clock(4_000)
     rig.vehicle.loss = loss
-    rig.vehicle.at += [(rig.vehicle.now_ns + i * S, lambda: clock(rig.vehicle, 6_000)) for i in range(5)]
     rig.vehicle.run(watched, 30.0, rig.feed)
     assert watched.kept.found is found
     assert {m.get_type() for _, m in rig.vehicle.sent} == {"PARAM_REQUEST_READ"}
@@ -77,12 +71,15 @@ def test_AT_4c_persisted_lost_or_changed(after: dict[str, float], found: Keeping
 
 def test_AT_4c_a_clock_that_jumps_a_little_is_no_reboot_and_silence_after_one_is_no_answer() -> None:
     rig = Rig()
+    rig.vehicle.clock(600_000)
+    rig.vehicle.run(None, 2.0, rig.feed)
     watched = Watched(rig, boot_ms=600_000)
-    clock(rig.vehicle, 598_000)  # overtaken
+    rig.vehicle.say(dialect.MAVLink_system_time_message(0, 601_100))  # overtaken
+    rig.vehicle.say(dialect.MAVLink_system_time_message(0, 4_000))  # and nothing that goes on from here
     rig.vehicle.run(watched, 5.0, rig.feed)
     assert not rig.vehicle.sent
     rig.vehicle.deaf = True
-    clock(rig.vehicle, 4_000)
+    rig.vehicle.clock(4_000)
     rig.vehicle.run(watched, 60.0, rig.feed)
     assert watched.kept.given_up and watched.kept.found is None
     assert len(rig.vehicle.sent) == 90
@@ -114,7 +111,7 @@ class Bench:
         self.clock.now_ns = now_ns
         if self.boot_ms is not None and now_ns % S == 0:
             self.boot_ms += 1000
-            clock(self.vehicle, self.boot_ms)
+            self.vehicle.clock(self.boot_ms)
             if self.uid2:
                 uid2 = self.uid2.ljust(18, b"\0")
                 self.vehicle.say(

@@ -214,6 +214,18 @@ class Assembler:
         known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False
         return sample
 
+    def rebooted(self, boot_ns: int) -> None:
+        """The clock shows boot_ns since a reboot, as others know. Nothing new where readings said so before."""
+        latest = self.clock.latest_ns
+        if latest is not None and latest - boot_ns > _BACK_NS:
+            self.clock = BootClock()
+            self.reboots += 1
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self.motion = Motion(self._own)
+        self._compasses.clear()
+
     def _in_time(self, boot_ns: int) -> bool:
         tick = self.clock.hear(boot_ns)
         if tick is Tick.GOES_ON:
@@ -221,10 +233,8 @@ class Assembler:
         self.counts[f"clock: {tick.value}"] += 1
         if tick is Tick.DOUBT:
             return False
-        if tick is Tick.REBOOT:
-            self.reboots += 1
-        self.motion = Motion(self._own)
-        self._compasses.clear()
+        self.reboots += tick is Tick.REBOOT
+        self._begin_anew()
         return True
 
     def _source(self, reading: MagReading) -> _Compass | None:

@@ -1,8 +1,8 @@
 """Did the values outlive the reboot? Read again what was written, once the autopilot has started anew (AT-4c).
 
 An autopilot may answer for a value from its memory and lose it with the power: ArduPilot saves in the background, PX4
-when it finds the time. That it rebooted is told by its own clock alone, which then shows less than before: ours may
-jump, and a companion usually loses power together with the autopilot.
+when it finds the time. That it rebooted is told by its own clock alone (see boot_clock), which then shows less than
+when the write ended: ours may jump, and a companion usually loses power together with the autopilot.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from enum import Enum
 
 from magmav.mavlink.autopilot.adapter import Adapter
+from magmav.mavlink.boot_clock import BACK_MS
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.dialogue import Dialogue
 from magmav.mavlink.float32 import same
@@ -20,7 +21,6 @@ _SECOND = 1_000_000_000
 _SETTLE_NS = 3 * _SECOND  # parameters are loaded, and packets from before have arrived
 _RETRY_NS = _SECOND
 _TRIES = 30
-_JUMP_MS = 3000  # packets overtake one another by less
 
 
 class Keeping(Enum):
@@ -54,22 +54,22 @@ class Kept:
         self._written = dict(written)
         self._before = dict(before)
         self._boot_ms = boot_ms
-        self._boots = presence.boots
+        self._boots = presence.clock.boots
         self._rebooted_ns: int | None = None
         self._talk: Dialogue | None = None
 
     def on_message(self, message: Message, route: str, now_ns: int) -> None:
-        """Watch the autopilot's clock, then take its values."""
+        """Watch the autopilot's clock, then take its values. ``presence`` has heard the message before."""
         autopilot = self._presence.autopilot
         sender = message.get_srcSystem(), message.get_srcComponent(), route
         if autopilot is None or sender != autopilot.pin:
             return
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if self._rebooted_ns is None and boot_ms is not None:
-            if boot_ms < self._boot_ms - _JUMP_MS or self._presence.boots != self._boots:
+        clock = self._presence.clock
+        if self._rebooted_ns is None and clock.ms is not None:
+            if clock.boots != self._boots or clock.ms < self._boot_ms - BACK_MS:
                 self._rebooted_ns = now_ns
             else:
-                self._boot_ms = max(self._boot_ms, boot_ms)
+                self._boot_ms = max(self._boot_ms, clock.ms)
         if self._talk is not None and message.get_type() == "PARAM_VALUE":
             self._talk.heard(message, None)
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from magmav.mavlink.boot_clock import BootClock
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.manners import Manners
 
@@ -27,7 +28,6 @@ ROUTE_SILENT_NS = 5 * _SECOND
 CLAIM_NS = 10 * _SECOND
 MOST_SEEN = 256
 _SILENT_NS = 30 * _SECOND
-_BOOT_JUMP_MS = 3000
 _INVALID = dialect.MAV_AUTOPILOT_INVALID
 
 
@@ -54,7 +54,7 @@ class Presence:
 
     autopilot : None until latched.  ambiguous : the systems heard when none could be chosen.
     second_route : another route that claimed to be the same autopilot in the last 10 s, or "".
-    boots : how often its boot clock jumped back, that is, how often it rebooted.
+    clock : the autopilot's own, over its route.
     """
 
     def __init__(self, component: int = 191, target_system: int | None = None, manners: Manners | None = None) -> None:
@@ -67,14 +67,18 @@ class Presence:
         self.autopilot: Autopilot | None = None
         self.ambiguous: tuple[int, ...] = ()
         self.second_route = ""
-        self.boots = 0
         self._manners = Manners() if manners is None else manners
         self._seen: dict[tuple[int, int], Autopilot] = {}
         self._first_ns: int | None = None
         self._route_ns = 0  # anything at all from the autopilot over its route
         self._claim_ns = 0
-        self._boot_ms: int | None = None
+        self.clock = BootClock()
         self._next_heartbeat_ns: int | None = None
+
+    @property
+    def boots(self) -> int:
+        """How often it was seen to reboot."""
+        return self.clock.boots
 
     @property
     def system(self) -> int:
@@ -159,7 +163,8 @@ class Presence:
         if self.autopilot is None:
             self._latch(now_ns)
         elif self._better(sender):
-            self.autopilot, self._boot_ms, self._route_ns = self._seen[sender], None, now_ns
+            self.autopilot, self._route_ns = self._seen[sender], now_ns
+            self.clock.forget()
         elif self.autopilot.pin[:2] == sender:
             self.autopilot = self._seen[sender]
 
@@ -194,14 +199,7 @@ class Presence:
             self._claim(route, now_ns)
             return
         self._route_ns = now_ns
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is None:
-            return
-        if self._boot_ms is not None and boot_ms < self._boot_ms - _BOOT_JUMP_MS:
-            self.boots += 1
-        elif self._boot_ms is not None:
-            boot_ms = max(boot_ms, self._boot_ms)  # packets overtake one another; that is no reboot
-        self._boot_ms = boot_ms
+        self.clock.on_message(message, now_ns)
 
     def _claim(self, route: str, now_ns: int) -> None:
         self.second_route = route

@@ -35,7 +35,7 @@ class Watch:
 
     def __init__(self, presence: Presence) -> None:
         self.presence = presence
-        self._pin: tuple[int, int, str] | None = None
+        self._pin: tuple[int, int, str, int] | None = None
         self._forget()
 
     def _forget(self) -> None:
@@ -56,8 +56,9 @@ class Watch:
         autopilot = self.presence.autopilot
         if autopilot is None:
             return
-        if self._pin != autopilot.pin:
-            self._pin = autopilot.pin
+        pin = (*autopilot.pin, self.presence.boots)  # what was seen before a reboot says nothing of after it
+        if self._pin != pin:
+            self._pin = pin
             self._forget()
         kind = message.get_type()
         if (message.get_srcSystem(), message.get_srcComponent()) != autopilot.pin[:2]:
