@@ -13,7 +13,8 @@ from magmav.core.types import Change, FieldModel, Reason, UploadResult
 from magmav.dry import every_message
 from magmav.link import Link
 from magmav.mavlink.autopilot.ardupilot import offset_names
-from magmav.mavlink.change import CONFIRM_ABOVE_MG, code_needed, largest_step_mg
+from magmav.mavlink.change import CONFIRM_ABOVE_MG, adapter_for, code_needed, largest_step_mg
+from magmav.mavlink.kept import Keeping
 from magmav.mavlink.signing import Signing
 from magmav.own_params import COMPASSES
 from magmav.pipeline import Pipeline
@@ -186,6 +187,14 @@ def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
     return [{"code": r.name, "text": r.text} for r in reasons]
 
 
+def note(row: Write) -> str:
+    """What was found after the reboot, and why it proves no more than that; "" where there is nothing to say."""
+    said = [] if row.kept is None else [f"{row.kept.name}, {row.kept.value}"]
+    if row.result is UploadResult.WRITTEN_UNPROVEN and row.kept in (None, Keeping.PERSISTED):
+        said.append(adapter_for(row.change).unproven)
+    return "; ".join(filter(None, said))
+
+
 def history_entry(row: Write) -> Result:
     """One line of ``magmav history``."""
     result = row.result
@@ -201,6 +210,7 @@ def history_entry(row: Write) -> Result:
         "undone": row.undone,
         "vehicle": row.vehicle,
         "kept": None if row.kept is None else row.kept.name,
+        "note": note(row),
         "old": dict(zip(row.change.names, row.change.old, strict=True)),
         "new": dict(zip(row.change.names, row.change.new, strict=True)),
     }

@@ -153,7 +153,7 @@ class Desk:
             when = datetime.fromtimestamp(e["unix_s"], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
             how = e["result"] or "cut short" + (", undone since" if e["undone"] else "")
             moved = ", ".join(f"{n} {o:g} to {e['new'][n]:g}" for n, o in e["old"].items())
-            why = "".join(f"; {reason['text']}" for reason in e["reasons"])
+            why = "".join(f"; {text}" for text in (*(r["text"] for r in e["reasons"]), e["note"]) if text)
             out.append(f"{e['id']}: {when}, system {e['system']}, {e['action']} {how}: {moved}{why}")
         return out or ["nothing was ever written"]
 

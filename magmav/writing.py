@@ -288,3 +288,6 @@ class Writer:
         text = f"MMAG c{row.change.compass} {found.name}: {found.value}"
         _log.log(logging.INFO if found is Keeping.PERSISTED else logging.WARNING, "%s", text)
         self._announcer.say(_INFO if found is Keeping.PERSISTED else _WARNING, text, now_ns)
+        if row.result is UploadResult.WRITTEN_UNPROVEN and found is Keeping.PERSISTED:
+            _log.warning("compass %d stays WRITTEN_UNPROVEN: %s", row.change.compass, adapter_for(row.change).unproven)
+            self._announcer.say(_INFO, f"MMAG c{row.change.compass} stays unproven: look at its heading", now_ns)

@@ -11,9 +11,11 @@ from magmav_sim import Simulation, parse_scenario
 from test_upload_far import GROUND
 
 from magmav.core.types import Change, Reason, UploadResult
+from magmav.live import history_entry
 from magmav.mavlink.autopilot.plan import plan_change
 from magmav.mavlink.change import code_needed
 from magmav.mavlink.kept import Keeping
+from magmav.view.table import history_view, to_text
 
 PX4 = GROUND + b'[autopilot]\nkind = "px4"\n[autopilot.parameters]\nSENS_MAG_AUTOCAL = %d\n'
 
@@ -66,6 +68,8 @@ def test_AT_4c_px4_after_the_reboot_it_is_said_whether_the_values_held_and_the_r
     flight = Flight(Simulation(parse_scenario(PX4 % 0, "px4.toml"), 2), tmp_path)
     change = wanted(flight)
     assert ended(flight, change)[0] is UploadResult.WRITTEN_UNPROVEN
+    (row,) = flight.store.history()
+    assert row.kept is None and history_entry(row)["note"].startswith("no stream of PX4 shows their effect")
     flight.said()
     flight.fly(seconds=15.0)
     flight.sim.autopilot.reboot()
@@ -78,6 +82,11 @@ def test_AT_4c_px4_after_the_reboot_it_is_said_whether_the_values_held_and_the_r
     assert any(found.name in text for text in texts), texts
     (row,) = flight.store.history()
     assert row.kept is found
+    assert row.result is UploadResult.WRITTEN_UNPROVEN, "what no stream can show is never called proven (S11)"
+    assert any("stays unproven" in text for text in texts) is not loses
+    entry = history_entry(row)
+    assert entry["note"].startswith(found.name) and ("no stream of PX4" in entry["note"]) is not loses
+    assert " ".join(entry["note"].split()[:4]) in " ".join(to_text(history_view([entry]), width=300).split())
     if not loses:
         assert ended(flight, row.change, row.id) == (UploadResult.ALL_OLD, ())
         assert held(flight, change) == change.old

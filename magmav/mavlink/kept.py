@@ -28,7 +28,7 @@ class Keeping(Enum):
 
     PERSISTED = "written values outlived the reboot"
     LOST = "written values were gone after the reboot: upload again"
-    CHANGED = "somebody else wrote other values since"
+    CHANGED = "somebody else, or the autopilot itself, wrote other values since"
 
 
 class Kept:

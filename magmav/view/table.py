@@ -158,6 +158,7 @@ def history_view(entries: Iterable[Json]) -> RenderableType:
         result = entry.get("result")
         outcome = "cut short" if result is None else _outcome(result)
         outcome += "; undone later" if entry.get("undone") else ""
+        outcome += f"; {entry['note']}" if entry.get("note") else ""
         texts = (*cells, _word(entry.get("action")), outcome, _changes(entry))
         table.add_row(*(_line(text) for text in texts))
     return table if count else _line("nothing was ever written")

@@ -43,6 +43,11 @@ class Adapter(Protocol):
         """Messages that are wanted now and then besides those every autopilot sends."""
         ...
 
+    @property
+    def unproven(self) -> str:
+        """Why a write stays WRITTEN_UNPROVEN even when its values outlived a reboot; "" where a stream proves it."""
+        ...
+
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
         """Parameters to fetch for compasses (1, 2 or 3). ValueError for another number.
 

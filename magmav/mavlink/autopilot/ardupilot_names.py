@@ -78,6 +78,7 @@ class ArduPilot:
     """Adapter for MAV_AUTOPILOT_ARDUPILOTMEGA: mG, added, body axes; numbers as floats; all streams corrected."""
 
     kind = int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
+    unproven = ""
     least_step_mg = 0.0
     unit_mg = 1.0
     compass_streams: tuple[str, ...] = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3")

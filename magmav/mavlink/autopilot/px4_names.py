@@ -50,6 +50,7 @@ class Px4:
     least_step_mg = 10.0
     unit_mg = MG_PER_GAUSS
     compass_streams: tuple[str, ...] = ("SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")  # there is no RAW_IMU
+    unproven = "no stream of PX4 shows their effect: SCALED_IMU has no offsets in it, HIGHRES_IMU not EKF2's own bias"
     slow_streams: tuple[str, ...] = ("MAG_CAL_REPORT",)  # which slot a compass uses; sent when parameters change
 
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
@@ -104,7 +105,8 @@ class Px4:
     def proof_streams(self, compass: int) -> tuple[str, ...]:
         """None: SCALED_IMU knows no offsets, and from HIGHRES_IMU EKF2 takes a bias that it learns anew when they move.
 
-        So a write ends WRITTEN_UNPROVEN and a reboot is advised.
+        How much that bias was before and is after, no message tells, so what HIGHRES_IMU moves by is no proof (S11).
+        So a write ends WRITTEN_UNPROVEN and stays it; a reboot is advised, after which its values are read again.
         """
         return ()
 
