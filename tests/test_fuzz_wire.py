@@ -43,8 +43,11 @@ def test_no_damage_leaves_the_frame_in_it_and_none_of_it_is_believed(name: str, 
     hurt = damaged(frame, how, mutator.dice)
     assert frame not in hurt
     codec = Codec()
-    believed = codec.decode(hurt, "udp:1", whole=True) + codec.decode(frame, "udp:1", whole=True)
-    assert all(bytes(m.get_msgbuf()) != frame for m in believed[:-1]) and bytes(believed[-1].get_msgbuf()) == frame
+    hurt_believed = codec.decode(hurt, "udp:1", whole=True)
+    whole_believed = codec.decode(frame, "udp:1", whole=True)
+    assert all(bytes(m.get_msgbuf()) != frame for m in hurt_believed)
+    # The one message that carries somebody's key is never decoded, so that no part of us can hold or print it.
+    assert [bytes(m.get_msgbuf()) for m in whole_believed] == ([] if name == "SETUP_SIGNING" else [frame])
 
 
 class Shaken:
