@@ -19,6 +19,7 @@ from typing import Any
 from MAVProxy.modules.lib import mp_module
 
 from magmav.geomag import world_magnetic_model
+from magmav.host_signing import HostKey, HostSigning
 from magmav.link.fed import FedLink
 from magmav.plugin import COMMANDS, Plugin
 from magmav.settings import SettingsError, load
@@ -26,6 +27,7 @@ from magmav.store import default_path
 
 # MAVProxy finds a module again, to unload it, by the name it was loaded with.
 NAME = "magmav.mavproxy"
+_UNKNOWN = "mavproxy:unknown"
 
 
 class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships no types
@@ -40,16 +42,18 @@ class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships 
         except SettingsError as error:
             raise ImportError(f"MAGMAV_CONFIG: {error}") from None  # the one error MAVProxy shows and survives
         self.link = FedLink("mavproxy")
+        self.signing: dict[str, HostSigning] = {}
         self.plugin = Plugin(self.link, settings, world_magnetic_model, default_path())
         self.add_command("magmav", self.cmd_magmav, "keep the compass calibrated", list(COMMANDS))
-        for master in mpstate.mav_master:
-            if getattr(getattr(master.mav, "signing", None), "sign_outgoing", False):
-                self.show("this link is signed and magmav's own messages are not: expect no answer to them")
 
     def mavlink_packet(self, packet: Any) -> None:
         """A message MAVProxy took from one of its links."""
-        if packet.get_type() != "BAD_DATA":
-            self.link.push(packet.get_msgbuf(), self._route(packet))
+        if packet.get_type() == "BAD_DATA":
+            return
+        route = self._route(packet)
+        frame = self._signing_of(route).heard(bytes(packet.get_msgbuf()), self._key_of(route))
+        if frame is not None:
+            self.link.push(frame, route)
 
     def idle_task(self) -> None:
         """Called many times a second: send what is due, show what is new."""
@@ -75,11 +79,20 @@ class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships 
     def _flush(self) -> None:
         for data, route in self.link.take():
             for master in self.mpstate.mav_master:
-                if route in ("", _name(master)):
+                name = _name(master)
+                if route in ("", name):
                     try:
-                        master.write(data)
+                        master.write(self._signing_of(name).sent(data, _key(master)))
                     except OSError:
                         self.link.counts["send errors"] += 1
+
+    def _signing_of(self, route: str) -> HostSigning:
+        return self.signing.setdefault(route, HostSigning())
+
+    def _key_of(self, route: str) -> HostKey | None:
+        """The key of the link of this route; where the link is not known, of any that has one."""
+        keys = [_key(m) for m in self.mpstate.mav_master if route in (_name(m), _UNKNOWN)]
+        return next((key for key in keys if key is not None), None)
 
     def _route(self, packet: Any) -> str:
         """Which of MAVProxy's links it came over. Modules are not told, but each link keeps its latest messages."""
@@ -92,7 +105,15 @@ class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships 
             # MAVProxy may keep a copy of the message, but the bytes in it are the same object.
             if latest is not None and latest.get_msgbuf() is packet.get_msgbuf():
                 return _name(master)
-        return "mavproxy:unknown"  # never pinned as the vehicle's while a known link brings it
+        return _UNKNOWN  # never pinned as the vehicle's while a known link brings it
+
+
+def _key(master: Any) -> HostKey | None:
+    """How MAVProxy signs on this link, now: `signing setup`, `key` and `disable` may come at any time."""
+    signing = master.mav.signing
+    if not signing.sign_outgoing or signing.secret_key is None:
+        return None
+    return HostKey(bytes(signing.secret_key), signing.link_id, signing.timestamp)
 
 
 def _name(master: Any) -> str:

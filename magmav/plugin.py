@@ -13,11 +13,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from magmav.coaching import Coaching
-from magmav.core.types import FieldModel, Reading, Record, State
+from magmav.companion import wanted_rates
+from magmav.core.types import FieldModel, Reading, Reason, Record, State
+from magmav.dry import every_message
 from magmav.link.fed import FedLink
 from magmav.live import Session, history_entry
-from magmav.mavlink.change import code_needed, dry_run
+from magmav.mavlink.change import code_needed
 from magmav.mavlink.upload import Upload
+from magmav.own_params import COMPASSES
 from magmav.settings import Settings
 from magmav.store import Store, StoreError
 from magmav.view.reporter import sentence
@@ -106,6 +109,8 @@ class Desk:
         out = [f"system {autopilot.system}, {kind}, {'armed' if autopilot.armed else 'disarmed'}, {autopilot.route}"]
         if presence.second_route:
             out.append(f"a second route claims to be the same vehicle: {presence.second_route}; uploads are refused")
+        if self._companion.sealed:
+            out.append(f"{Reason.LINK_SIGNED_READ_ONLY.name}: {Reason.LINK_SIGNED_READ_ONLY.text}")
         mine = [r for (system, _), r in sorted(self._latest.items()) if system == autopilot.system]
         for r in mine:
             old_s = (self._session.service.now_ns - r.t_ns) / 1e9
@@ -180,7 +185,10 @@ class Desk:
         if change is None:
             return [f"compass {compass}: nothing to write; magmav status says what is missing"]
         ready = record is not None and record.verdict.state is State.READY
-        lines = dry_run(change, self._companion.settings.upload.confirm_above_mg)
+        flown, settings = self._companion.flown(), self._companion.settings
+        held = [] if flown is None else [name for c in COMPASSES for name in flown.calibrations.stored(c)]
+        rates = wanted_rates(settings, self._companion.kind)
+        lines = every_message(change, rates, held, settings.upload.confirm_above_mg)
         return [*([] if ready else [f"compass {compass} is not READY: an upload would be refused"]), *lines]
 
     def _outcome(self, ended: Upload) -> list[str]:

@@ -15,6 +15,7 @@ from flight_rig import Flight, ready, staying
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+from test_dry_run import line
 
 from magmav.geomag import world_magnetic_model
 from magmav.link.fed import FedLink
@@ -135,10 +136,13 @@ class Story:
         self.quiet = self.sets()
         self.code = code_needed(f.companion.plan(1))
         self.confirm_before = f.companion.confirm
+        f.said()
         self.begun = desk.answer(["upload", "--confirm-change", str(self.code)])
         f.fly(seconds=1.0)
         self.busy = desk.answer(["upload"]), desk.answer(["restore"]), desk.answer(["status"])
         f.fly(lambda: f.companion.job is None, 60.0)
+        f.fly(seconds=2.0)
+        self.sent = {line(m) for m in f.said()}
         self.uploaded = desk.news()
         self.new = [f.value(n) for n in _OFFSETS]
         self.other = desk.answer(["restore", "2"])
@@ -183,6 +187,17 @@ def test_S8_a_large_change_wants_the_code_and_the_console_names_it(story):
     assert any(f"magmav upload 1 --confirm-change {story.code}" in line for line in news)
     assert any(str(story.code) in line for line in story.dry)
     assert story.quiet == []  # neither the dry run nor the refusal wrote anything
+
+
+def test_the_dry_run_names_every_message_of_the_write_and_the_code_and_sends_none(story):
+    said = {text.split(" (")[0] for text in story.dry}
+    always = {"NAMED_VALUE_FLOAT"}  # the heading that goes out whether something is written or not
+    assert story.sent - said <= always, sorted(story.sent - said)
+    assert {text for text in said if text.startswith("PARAM_SET COMPASS_OFS")} <= story.sent
+    assert {"HEARTBEAT", "PARAM_REQUEST_READ COMPASS_OFS_X"} <= said
+    assert any(text.startswith("COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL RAW_IMU") for text in said)
+    assert any(f"confirm with code {story.code}" in text for text in story.dry)
+    assert story.quiet == []
 
 
 def test_upload_and_restore_go_through_the_transaction(story):

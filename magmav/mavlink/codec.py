@@ -21,6 +21,7 @@ _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _KNOWN_INCOMPAT = 0x01
 _LONGEST = 10 + 255 + 2 + 13
+_COMPONENT_METADATA = 397  # we send it, and the dialect lacks it: see metadata
 
 
 class Outgoing(NamedTuple):
@@ -53,6 +54,11 @@ def is_signed(message: Message) -> bool:
     return bool(message.get_header().incompat_flags & _SIGNED)
 
 
+def number_of(frame: bytes) -> int:
+    """Message number of a whole frame."""
+    return frame[7] | frame[8] << 8 | frame[9] << 16 if frame[0] == _V2 else frame[5]
+
+
 class Codec:
     """Cuts frames per route, checks them, and packs our own messages.
 
@@ -69,6 +75,7 @@ class Codec:
         self._sequence: dict[tuple[int, int], int] = {}
         kinds = dialect.mavlink_map.items()
         self._seeds = {i: bytes((kind.crc_extra,)) for i, kind in kinds}  # the last byte of each message's checksum
+        self._seeds[_COMPONENT_METADATA] = bytes((182,))
         # SETUP_SIGNING carries a key: nobody here has any business with it (S17).
         self._wanted = {i for i, k in kinds if (wanted is None or k.msgname in wanted) and k.msgname != "SETUP_SIGNING"}
 
@@ -108,7 +115,7 @@ class Codec:
 
     def _frame(self, frame: bytes, out: list[Message]) -> bool:
         v2 = frame[0] == _V2
-        number = frame[7] | frame[8] << 8 | frame[9] << 16 if v2 else frame[5]
+        number = number_of(frame)
         seed = self._seeds.get(number)
         if seed is None:
             # No checksum seed, so nothing proves this is a frame: step one byte and look again.
@@ -142,14 +149,23 @@ class Codec:
         mav.seq = self._sequence.get(key, 0)
         frame = bytes(message.pack(mav))
         self._sequence[key] = (mav.seq + 1) & 0xFF
-        return frame if self.signer is None else self._signed(frame, self.signer)
+        return frame if self.signer is None else self.signed(frame, self.signer)
 
-    def _signed(self, frame: bytes, signer: Signer) -> bytes:
+    def signed(self, frame: bytes, signer: Signer) -> bytes:
+        """An unsigned MAVLink 2 frame with a signature. KeyError for a message that is not known."""
+        return signer.sign(self._flagged(frame, frame[2] | _SIGNED, frame[3:-2]))
+
+    def plain(self, frame: bytes) -> bytes | None:
+        """A whole frame without its signature; None where the message is not known."""
+        if frame[0] != _V2 or not frame[2] & _SIGNED:
+            return frame
+        return self._flagged(frame, frame[2] & ~_SIGNED, frame[3:-15]) if number_of(frame) in self._seeds else None
+
+    def _flagged(self, frame: bytes, flags: int, rest: bytes) -> bytes:
         """The checksum covers the flag that says signed, so it is made anew."""
-        number = frame[7] | frame[8] << 8 | frame[9] << 16
-        body = bytes((_V2, frame[1], frame[2] | _SIGNED)) + frame[3:-2]
-        crc = crc16.mcrf4xx(body[1:] + self._seeds[number])
-        return signer.sign(body + crc.to_bytes(2, "little"))
+        body = bytes((_V2, frame[1], flags)) + rest
+        crc = crc16.mcrf4xx(body[1:] + self._seeds[number_of(frame)])
+        return body + crc.to_bytes(2, "little")
 
 
 def _next_magic(data: bytes, at: int) -> int:

@@ -94,6 +94,11 @@ def readable_by_others(path: Path) -> bool:
     return bool(path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO))
 
 
+def unix_ns_of(stamp: int) -> int:
+    """UNIX time of a signing timestamp."""
+    return _EPOCH_NS + stamp * _UNIT_NS
+
+
 class StampFile:
     """Where the last timestamps are kept over restarts: a small file, replaced whole."""
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from contextlib import suppress
+from datetime import UTC, datetime
 
 import pytest
 from flight_rig import LEVEL
@@ -106,3 +108,29 @@ def test_mavproxy_fetches_sets_and_saves_our_parameters_and_sets_an_offset(tmp_p
     assert count >= 30
     assert len(ours) == count
     assert math.isnan(ours["MMAG_HDG_T"])  # nothing was learnt on the ground; MAVProxy saves that as it is
+
+
+@pytest.mark.parametrize("keyed", [True, False])
+def test_the_plugin_on_a_link_that_mavproxy_signs_is_believed_and_without_the_key_only_listens(tmp_path, keyed):
+    key = hashlib.sha256(b"aviary").hexdigest()  # as MAVProxy makes it of the word
+    # Timestamps over a minute behind MAVProxy's are no good signature: the vehicle has the day's time.
+    now = GROUNDED.replace("2026-11-22T10:00:00Z", f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}")
+    (scenario := tmp_path / "signed.toml").write_text(now + f'[[fault]]\nkind = "signed"\nkey = "{key}"\n')
+    port = free_port()
+    options = (f"--master=udpin:127.0.0.1:{port}", "--load-module=signing,magmav.mavproxy")
+    with console(tmp_path, *options) as mavproxy:
+        mavproxy.expect("magmav: at work")
+        if keyed:
+            mavproxy.say("signing key aviary")
+            mavproxy.expect("Setup signing key")
+        with program(magmav_words("sim", scenario, "--to", f"udpout:127.0.0.1:{port}"), tmp_path):
+            ask_until(mavproxy, "magmav status", "magmav: system 1, ArduPilot, disarmed, mavproxy:1")
+            if keyed:
+                # It was asked for RAW_IMU, and for the offsets, by messages it believed.
+                ask_until(mavproxy, "magmav status", "magmav: compass 1 of system 1: learning")
+                ask_until(mavproxy, "magmav upload --dry-run", "magmav: (compass 1: nothing to write|.*HEARTBEAT)")
+            else:
+                ask_until(mavproxy, "magmav status", "magmav: LINK_SIGNED_READ_ONLY")
+                mavproxy.say("magmav upload")
+                mavproxy.expect("magmav: refused: the vehicle signs")
+        mavproxy.end()
