@@ -24,6 +24,7 @@ from magmav.link.fed import FedLink
 from magmav.plugin import COMMANDS, Plugin
 from magmav.settings import SettingsError, load
 from magmav.store import default_path
+from magmav.whereabouts import is_autopilot
 
 # MAVProxy finds a module again, to unload it, by the name it was loaded with.
 NAME = "magmav.mavproxy"
@@ -50,6 +51,8 @@ class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships 
         """A message MAVProxy took from one of its links."""
         if packet.get_type() == "BAD_DATA":
             return
+        if is_autopilot(packet):
+            self.plugin.vehicle(packet.get_srcSystem())
         route = self._route(packet)
         frame = self._signing_of(route).heard(bytes(packet.get_msgbuf()), self._key_of(route))
         if frame is not None:
@@ -58,6 +61,7 @@ class MagmavModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy ships 
     def idle_task(self) -> None:
         """Called many times a second: send what is due, show what is new."""
         self._flush()
+        self.plugin.follow(self.target_system)  # `vehicle N`, or the first one MAVProxy heard
         for line in self.plugin.lines():
             self.show(line)
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from magmav.coaching import Coaching
-from magmav.companion import wanted_rates
+from magmav.companion import MagCompanion, wanted_rates
 from magmav.core.types import FieldModel, Reading, Reason, Record, State
 from magmav.dry import every_message
 from magmav.link.fed import FedLink
@@ -21,7 +21,7 @@ from magmav.live import Session, history_entry
 from magmav.mavlink.change import code_needed
 from magmav.mavlink.upload import Upload
 from magmav.own_params import COMPASSES
-from magmav.settings import Settings
+from magmav.settings import Settings, with_value
 from magmav.store import Store, StoreError
 from magmav.view.reporter import sentence
 
@@ -39,8 +39,10 @@ _KINDS = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
 class Desk:
     """Answers commands and tells news; call it from the thread that turns the session, between packets."""
 
-    def __init__(self, session: Session, store: Store) -> None:
+    def __init__(self, session: Session, store: Store, heard: Callable[[], Iterable[int]] = tuple) -> None:
         self._session = session
+        self._heard = heard
+        self._told: set[int] = set()
         self._companion = session.companion
         self._store = store
         self._latest: dict[tuple[int, int], Record] = {}
@@ -71,6 +73,9 @@ class Desk:
         if ended is not None and ended is not self._ended:
             self._news += self._outcome(ended)
         self._ended = ended
+        if self._companion.presence.autopilot is not None and not self._told.issuperset(others := self._others()):
+            self._told |= others
+            self._news.append(self._alone(others))
         out, self._news = self._news, []
         return out
 
@@ -111,6 +116,8 @@ class Desk:
             out.append(f"a second route claims to be the same vehicle: {presence.second_route}; uploads are refused")
         if self._companion.sealed:
             out.append(f"{Reason.LINK_SIGNED_READ_ONLY.name}: {Reason.LINK_SIGNED_READ_ONLY.text}")
+        if self._others():
+            out.append(self._alone(self._others()))
         mine = [r for (system, _), r in sorted(self._latest.items()) if system == autopilot.system]
         for r in mine:
             old_s = (self._session.service.now_ns - r.t_ns) / 1e9
@@ -164,10 +171,17 @@ class Desk:
 
     # ------------------------------------------------------------ inside
 
+    def _others(self) -> set[int]:
+        return set(self._heard()) - {self._companion.presence.system}
+
+    def _alone(self, others: set[int]) -> str:
+        names = ", ".join(str(system) for system in sorted(others))
+        return f"also heard: system {names}; only system {self._companion.presence.system} is served here"
+
     def _nobody(self) -> str:
         presence = self._companion.presence
         if presence.ambiguous:
-            return f"several vehicles {presence.ambiguous}: set vehicle.system in the settings file, then load again"
+            return f"several vehicles {presence.ambiguous}: choose one here, or vehicle.system in the settings file"
         return "no vehicle yet: no autopilot's heartbeat was heard" if presence.autopilot is None else ""
 
     def _busy(self) -> str:
@@ -204,7 +218,8 @@ class Plugin:
     """A Session on a FedLink in a thread of its own. Everything here may be called from the host's thread.
 
     The thread opens the store, so that nobody else ever touches it; a store that cannot be opened is said in
-    ``lines``.
+    ``lines``. One vehicle is served: the one the settings name, else the one the host names (``follow``), else the
+    only one there is. When the host names another, that one is met anew as soon as no write is under way.
     """
 
     def __init__(self, link: FedLink, settings: Settings, model: FieldModel, store: Path) -> None:
@@ -215,8 +230,20 @@ class Plugin:
         self._asked: queue.SimpleQueue[tuple[str, ...]] = queue.SimpleQueue()
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._loaded = threading.Event()
+        self._system = settings.vehicle.system
+        self._chosen = 0  # by the host
+        self._vehicles: set[int] = set()
         self._thread = threading.Thread(target=self._work, name="magmav", daemon=True)
         self._thread.start()
+
+    def follow(self, system: int) -> None:
+        """The host speaks to this vehicle now; 0 for none in particular."""
+        self._chosen = system
+
+    def vehicle(self, system: int) -> None:
+        """The host heard an autopilot of this system."""
+        if system not in self._vehicles:
+            self._vehicles = self._vehicles | {system}  # the other thread may be looking at the old one
 
     def command(self, words: Sequence[str]) -> None:
         """One command; its answer comes out of ``lines``."""
@@ -243,18 +270,36 @@ class Plugin:
     def _work(self) -> None:
         try:
             with Store(self._path) as store:
-                session = Session.on(self.link, self._settings, self._model, store)
-                desk = Desk(session, store)
-                session.service.watchers += (desk.watch,)
                 self._said.put("at work; magmav help shows the commands")
-                session.service.run(lambda: self._between(desk))
-                if session.companion.job is not None:
-                    self._said.put("stopped in the middle of a write: it is undone when magmav runs again")
+                while self._serve(store):
+                    self._system = self._chosen
+                    self._said.put(f"system {self._system} is served from here on; learning begins anew")
         except StoreError as error:
             self._said.put(f"stopped: {error}")
 
+    def _serve(self, store: Store) -> bool:
+        """One vehicle, until the link is closed; True where it ends because the host chose another one."""
+        session = Session.on(
+            self.link, with_value(self._settings, "vehicle", "system", self._system), self._model, store
+        )
+        desk = Desk(session, store, lambda: self._vehicles)
+        session.service.watchers += (desk.watch,)
+        session.service.run(lambda: self._between(desk) or self._elsewhere(session.companion))
+        if session.companion.job is not None:
+            self._said.put("stopped in the middle of a write: it is undone when magmav runs again")
+        return self._elsewhere(session.companion) and not self.link.closed
+
+    def _elsewhere(self, companion: MagCompanion) -> bool:
+        """The host speaks to another vehicle, nothing forbids to follow, and nothing is being written."""
+        fixed = self._settings.vehicle.system
+        if fixed or self._chosen in (0, self._system) or companion.job is not None:
+            return False
+        presence = companion.presence
+        met = presence.autopilot is not None or self._system != 0  # else the one there is will be found
+        return bool(presence.ambiguous) or (met and presence.system != self._chosen)
+
     def _between(self, desk: Desk) -> bool:
-        """Between two packets: commands, answers, news. Never ends the work; closing the link does."""
+        """Between two packets: commands, answers, news. Never ends the work."""
         self._loaded.set()
         while not self._asked.empty():
             for line in desk.answer(self._asked.get_nowait()):

@@ -22,7 +22,7 @@ from magmav.link.fed import FedLink
 from magmav.link.memory import SetClock
 from magmav.mavlink.change import code_needed
 from magmav.plugin import USAGE, Desk, Plugin
-from magmav.settings import Settings
+from magmav.settings import Settings, with_value
 
 ROOT = Path(__file__).parents[1]
 _OFFSETS = ("COMPASS_OFS_X", "COMPASS_OFS_Y", "COMPASS_OFS_Z")
@@ -304,6 +304,62 @@ def test_a_host_feeds_it_and_gets_answers_frames_and_last_words(tmp_path):
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in sent if m.get_type() == "COMMAND_LONG"} == {(9, 191)}
     plugin.command(["status"])
     assert plugin.lines()[-1] == "not running; load the module again"
+
+
+def test_a_second_vehicle_is_said_and_the_one_the_host_speaks_to_is_served(tmp_path):
+    plugin = Plugin(FedLink("host"), Settings(), world_magnetic_model, tmp_path / "s.sqlite")
+    ends = {n: dialect.MAVLink(None, srcSystem=n, srcComponent=1) for n in (1, 2)}
+    reader, sent = dialect.MAVLink(None), []
+
+    def until(text, *systems):
+        lines, end = [], time.monotonic() + _PATIENCE_S
+        while time.monotonic() < end and not any(text in line for line in lines):
+            for n in systems:
+                plugin.vehicle(n)
+                plugin.link.push(bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(ends[n])), f"host:{n}")
+            sent.extend(m for data, _ in plugin.link.take() for m in reader.parse_buffer(data) or [])
+            plugin.command(["status"])
+            time.sleep(0.1)
+            lines += plugin.lines()
+        assert any(text in line for line in lines), lines
+        return lines
+
+    plugin.follow(1)  # as MAVProxy does with the first one it hears
+    lines = until("system 1, ArduPilot", 1)
+    assert not any("served" in line for line in lines)
+    lines = until("also heard: system 2; only system 1 is served here", 1, 2)
+    plugin.follow(2)
+    lines = until("system 2, ArduPilot", 1, 2)
+    assert "system 2 is served from here on; learning begins anew" in lines
+    until("also heard: system 1; only system 2 is served here", 1, 2)
+    assert plugin.stop()
+    by = {m.get_srcSystem() for m in sent if m.get_type() == "COMMAND_LONG" and m.target_system == 2}
+    assert by == {2}
+    plugin = Plugin(
+        FedLink("host"), with_value(Settings(), "vehicle", "system", 1), world_magnetic_model, tmp_path / "s.sqlite"
+    )
+    plugin.follow(2)
+    assert not any("served from" in line for line in until("system 1, ArduPilot", 1, 2)), (
+        "the settings file has said it"
+    )
+    assert plugin.stop()
+
+
+def test_several_at_once_are_nobody_until_the_host_names_one(tmp_path):
+    plugin = Plugin(FedLink("host"), Settings(), world_magnetic_model, tmp_path / "s.sqlite")
+    ends = {n: dialect.MAVLink(None, srcSystem=n, srcComponent=1) for n in (1, 2)}
+    lines, end = [], time.monotonic() + _PATIENCE_S
+    while time.monotonic() < end and not any("system 1, ArduPilot" in line for line in lines):
+        for n, mav in ends.items():
+            plugin.link.push(bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(mav)), f"host:{n}")
+        plugin.link.take()
+        plugin.command(["status"])
+        time.sleep(0.1)
+        lines += plugin.lines()
+        if any(line.startswith("several vehicles (1, 2): choose one") for line in lines):
+            plugin.follow(1)
+    assert any("system 1, ArduPilot" in line for line in lines), lines
+    assert plugin.stop()
 
 
 def test_a_store_that_cannot_be_opened_is_said_in_the_console(tmp_path):

@@ -62,6 +62,11 @@ class FedLink:
         except queue.Full:
             self.counts["dropped"] += 1
 
+    @property
+    def closed(self) -> bool:
+        """No packets come any more."""
+        return self._closed
+
     def take(self) -> list[tuple[bytes, str]]:
         """Frames to be sent since the last call, each with its route; an empty route means every link."""
         out = []

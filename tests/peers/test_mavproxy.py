@@ -134,3 +134,22 @@ def test_the_plugin_on_a_link_that_mavproxy_signs_is_believed_and_without_the_ke
                 mavproxy.say("magmav upload")
                 mavproxy.expect("magmav: refused: the vehicle signs")
         mavproxy.end()
+
+
+def test_the_plugin_names_a_second_vehicle_and_follows_mavproxys_vehicle_command(tmp_path):
+    port = free_port()
+    words = []
+    for system in (1, 2):
+        (where := tmp_path / f"{system}.toml").write_text(GROUNDED + f"[autopilot]\nsystem = {system}\n")
+        words.append(magmav_words("sim", where, "--to", f"udpout:127.0.0.1:{port}"))
+    with console(tmp_path, f"--master=udpin:127.0.0.1:{port}", "--load-module=magmav.mavproxy") as mavproxy:
+        mavproxy.expect("magmav: at work")
+        with program(words[0], tmp_path):
+            ask_until(mavproxy, "magmav status", "magmav: system 1, ArduPilot")
+            with program(words[1], tmp_path):
+                mavproxy.expect("magmav: also heard: system 2; only system 1 is served here")
+                mavproxy.say("vehicle 2")
+                mavproxy.expect("magmav: system 2 is served from here on; learning begins anew")
+                ask_until(mavproxy, "magmav status", "magmav: system 2, ArduPilot, disarmed, mavproxy:1")
+                ask_until(mavproxy, "magmav status", "magmav: compass 1 of system 2")
+        mavproxy.end()
