@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -98,8 +98,8 @@ class MagCompanion:
         self.presence = Presence(v.component, v.system or None, Manners(self.budget, files(own, __version__)))
         self._watch = Watch(self.presence)
         self.kind = _ARDUPILOT  # MAV_AUTOPILOT of the vehicle, once it is known
-        self._intervals = Intervals(self._rates(), self.presence)
-        self._fetch = ParamFetch(ADAPTERS[self.kind].names(COMPASSES), self.presence)
+        self._intervals = Intervals(self._rates(), self.presence, self.budget.room)
+        self._fetch = ParamFetch(ADAPTERS[self.kind].names(COMPASSES), self.presence, self.budget.room)
         self.announcer = Announcer(self.budget, settings.wire.heading_hz)
         self._coaching = Coaching(pipeline.vehicles, lambda text, now: self.announcer.say(_INFO, f"MMAG {text}", now))
         self.writer = Writer(
@@ -133,7 +133,7 @@ class MagCompanion:
     def ask_for(self, names: Iterable[str]) -> None:
         """Ask the vehicle for these messages only; whoever else asked for the others keeps them."""
         self._asks_for = frozenset(names)
-        self._intervals = Intervals(self._rates(), self.presence)
+        self._intervals = Intervals(self._rates(), self.presence, self.budget.room)
 
     def _rates(self) -> dict[str, float]:
         wanted = wanted_rates(self.settings, self.kind)
@@ -170,6 +170,10 @@ class MagCompanion:
     def believes(self, message: Message, route: str) -> bool:
         """Whether what it says of a vehicle counts (design, rule 11)."""
         return self.presence.believes(message, route)
+
+    def reached(self, system: int, copies: Mapping[str, int]) -> None:
+        """What is said to everybody goes out so often."""
+        self.budget.reaches(copies)
 
     @property
     def sealed(self) -> bool:
@@ -260,7 +264,7 @@ class MagCompanion:
     def _counted(self, out: list[Outgoing], now_ns: int) -> list[Outgoing]:
         """What must go out at once is paid back by what can wait: the whole stays in the budget (AT-9c)."""
         for item in out:
-            self.budget.force(item.message, now_ns)
+            self.budget.force(item.message, now_ns, item.route)
         return out
 
     def leave(self, now_ns: int) -> list[Outgoing]:

@@ -2,22 +2,21 @@
 
 A vehicle is whoever's autopilot is heard. What comes from it or is meant for it goes to its companion alone; what a
 ground station says to all goes to the vehicles on that station's route, or to all where none is. Each companion pins
-its own vehicle to one route, on whatever link that is. Vehicles on one route share its budget: behind one router or
-radio they share the air.
+its own vehicle to one route, on whatever link that is. All share the budget of each link: they share the air.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
 from magmav.companion import MagCompanion
 from magmav.core.types import FieldModel, Record
 from magmav.link import Link
-from magmav.mavlink.budget import Budget
+from magmav.mavlink.budget import Air, Budget
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.presence import Presence
 from magmav.mavlink.signing import Signing
@@ -54,7 +53,8 @@ class Fleet:
         self._keyed = keyed
         self._heard_ns: dict[int, int] = {}
         self._polled_ns: dict[int, int] = {}
-        self._budgets: dict[str, Budget] = {}
+        self._air = Air(settings.wire.budget_bps)
+        self._first = 0  # whose turn it is to have of the budget what is there
         self._looked_ns = 0
         wanted = settings.vehicle.system or None
         # Until somebody is heard: on a udpout link, or behind a router, nobody would speak first.
@@ -68,7 +68,7 @@ class Fleet:
         """To whom it concerns."""
         system = message.get_srcSystem()
         if system not in self.members and is_autopilot(message):
-            self._welcome(message, route, now_ns)
+            self._welcome(message, now_ns)
         out: list[Outgoing] = []
         for number in self._concerned(message, route):
             member = self.members[number]
@@ -98,11 +98,19 @@ class Fleet:
         if not self.members:
             return self._herald.poll(now_ns)
         out: list[Outgoing] = []
-        for system, member in self.members.items():
+        systems = list(self.members)
+        self._first = (self._first + 1) % len(systems)
+        for system in systems[self._first :] + systems[: self._first]:
+            member = self.members[system]
             if now_ns - self._polled_ns.get(system, -POLL_NS) >= POLL_NS:
                 self._polled_ns[system] = now_ns
                 out += _as(member, member.poll(now_ns))
         return out
+
+    def reached(self, system: int, copies: Mapping[str, int]) -> None:
+        """To that vehicle's own companion."""
+        if system in self.members:
+            self.members[system].reached(system, copies)
 
     def leave(self, now_ns: int) -> list[Outgoing]:
         """Last words to each."""
@@ -110,7 +118,7 @@ class Fleet:
 
     # ------------------------------------------------------------ who is served
 
-    def _welcome(self, message: Message, route: str, now_ns: int) -> None:
+    def _welcome(self, message: Message, now_ns: int) -> None:
         system, vehicle = message.get_srcSystem(), self._settings.vehicle
         if vehicle.system not in (0, system) or message.get_srcComponent() == vehicle.component:
             return
@@ -122,7 +130,6 @@ class Fleet:
             self.counts["too many vehicles"] += 1
             return
         own = msgspec.structs.replace(vehicle, system=system)
-        bps = self._settings.wire.budget_bps
         self._heard_ns[system] = now_ns
         self.members[system] = MagCompanion(
             msgspec.structs.replace(self._settings, vehicle=own),
@@ -130,8 +137,9 @@ class Fleet:
             self._store,
             self._unix_offset_ns,
             keyed=self._keyed,
-            budget=self._budgets.setdefault(route, Budget(bps, signed=self._keyed)),
+            budget=Budget(signed=self._keyed, air=self._air),
         )
+        self._air.vehicles = len(self.members)
         _log.warning("vehicle %d is heard", system)
 
     def _forget(self, system: int, now_ns: int) -> None:
@@ -143,8 +151,7 @@ class Fleet:
         for table in (self.members, self._heard_ns, self._polled_ns):
             table.pop(system, None)
         self._pipeline.forget(system)
-        in_use = {id(m.budget) for m in self.members.values()}
-        self._budgets = {r: b for r, b in self._budgets.items() if id(b) in in_use}
+        self._air.vehicles = len(self.members)
         self.counts["forgotten"] += 1
         _log.warning("vehicle %d was silent for %d s and is forgotten", system, GONE_NS // _SECOND)
 

@@ -12,6 +12,7 @@ from typing import Protocol
 from magmav.core.types import Reading, Record
 from magmav.hearing import Hearing
 from magmav.link import Link, Packet, routes_of, whole_frames
+from magmav.mavlink.budget import copies_by_link
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.signing import Signing
 from magmav.pipeline import Pipeline
@@ -38,6 +39,10 @@ class Companion(Protocol):
 
     def poll(self, now_ns: int) -> list[Outgoing]:
         """What is due now."""
+        ...
+
+    def reached(self, system: int, copies: Mapping[str, int]) -> None:
+        """What this system says to everybody went out so often, by link."""
         ...
 
     def leave(self, now_ns: int) -> list[Outgoing]:
@@ -128,6 +133,9 @@ class Service:
         for item in outgoing:
             sender = item.sender or self.companion.identity()
             ways = self._ways(item, sender[0])
+            if not item.route and ways:
+                reached = routes_of(self.link) if ways == ("",) else ways
+                self.companion.reached(sender[0], copies_by_link(reached))
             if ways:
                 frame = self.hearing.codec.encode(item.message, *sender)
                 for route in ways:

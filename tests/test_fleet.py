@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.fleet import GONE_NS, MOST
 from magmav.link import Packet
+from magmav.mavlink.budget import link_of
 from magmav.settings import Settings, with_value
 
 
@@ -33,13 +34,13 @@ def test_each_vehicle_has_its_own_companion_and_hears_nothing_of_the_others(tmp_
     craft = [Craft(n, f"udp:{n}") for n in (1, 2, 7)]
     sky = Airspace(tmp_path, *craft)
     sky.push(ground(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)), "gcs")
-    sky.run(40.0)
+    sky.run(80.0)  # one budget for all of them
     assert sorted(sky.fleet.members) == [1, 2, 7]
     for c in craft:
         heard = kinds(c.heard)
         assert strays(c.heard, c.system) == []
         assert speakers(c.heard) == {(c.system, 191)}
-        assert 35 <= heard["HEARTBEAT"] <= 41 and heard["PARAM_REQUEST_READ"] > 20 and heard["COMMAND_LONG"] > 5
+        assert 75 <= heard["HEARTBEAT"] <= 81 and heard["PARAM_REQUEST_READ"] > 20 and heard["COMMAND_LONG"] > 5
         assert sky.fleet.members[c.system].settled
         assert sky.service.pipeline.vehicles[c.system].calibrations.known(1)
     at_ground = sky.link.sent["gcs"]
@@ -47,11 +48,11 @@ def test_each_vehicle_has_its_own_companion_and_hears_nothing_of_the_others(tmp_
     assert {m.get_type() for m in at_ground} <= {"HEARTBEAT", "PARAM_VALUE", "STATUSTEXT", "NAMED_VALUE_FLOAT"}
 
 
-def test_vehicles_behind_one_router_share_its_route_and_its_budget(tmp_path: Path) -> None:
+def test_AT_9c_vehicles_behind_one_router_share_its_route_and_its_budget(tmp_path: Path) -> None:
     """Any ten seconds hold at most ten times 500 bytes, however many vehicles there are (AT-9c)."""
     craft = [Craft(n, "udp:router") for n in (1, 2, 3)]
     sky = Airspace(tmp_path, *craft)
-    sky.run(30.0)
+    sky.run(40.0)
     sent = []
     for _ in range(300):
         before = len(sky.link.raw["udp:router"])
@@ -60,6 +61,47 @@ def test_vehicles_behind_one_router_share_its_route_and_its_budget(tmp_path: Pat
     assert speakers(sky.link.sent["udp:router"]) == {(1, 191), (2, 191), (3, 191)}
     assert max(sum(sent[i : i + 100]) for i in range(200)) <= 5000
     assert all(m.settled for m in sky.fleet.members.values())
+
+
+def busiest_ten_seconds(sky: Airspace, seconds: float) -> dict[str, int]:
+    """By link: the most bytes that went out over all of its routes in any ten seconds."""
+    sent: dict[str, list[int]] = {}
+    for tick in range(round(seconds * 10)):
+        before = {r: len(frames) for r, frames in sky.link.raw.items()}
+        sky.run(0.1)
+        for route, frames in sky.link.raw.items():
+            at = sent.setdefault(link_of(route), [0] * round(seconds * 10))
+            at[tick] += sum(map(len, frames[before.get(route, 0) :]))
+    return {link: max(sum(at[i : i + 100]) for i in range(len(at) - 99)) for link, at in sent.items()}
+
+
+@pytest.mark.parametrize(("links", "grounds"), [(("", "", "", ""), 3), (("0>", "0>", "1>", "2>"), 1)])
+def test_AT_9c_all_routes_and_vehicles_of_a_link_stay_under_the_budget_together(
+    tmp_path: Path, links: tuple[str, ...], grounds: int
+) -> None:
+    """Also while all is read, and a ground station lists; what cannot wait goes out all the same."""
+    chosen = with_value(with_value(Settings(), "learn", "on", False), "attitude", "own", "complementary")
+    craft = [Craft(n, f"{link}udp:{n}") for n, link in enumerate(links, 1)]
+    sky = Airspace(tmp_path, *craft, settings=chosen)
+    stations = [f"{links[-1]}gcs{n}" for n in range(grounds)]
+    for route in stations:
+        sky.push(ground(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)), route)
+    sky.run(8.0)
+    for system in (1, 2, 3, 4):
+        sky.push(ground(dialect.MAVLink_param_request_list_message(system, 191)), stations[0])
+    before = {r: len(m) for r, m in sky.link.sent.items()}
+    most = busiest_ten_seconds(sky, 25.0)
+    assert all(n <= 5000 for n in most.values()), most
+    assert most[link_of(stations[0])] > 3500, "the budget is used"
+    for route in stations:
+        got = Counter((m.get_type(), m.get_srcSystem()) for m in sky.link.sent[route][before[route] :])
+        assert all(24 <= got["HEARTBEAT", system] <= 26 for system in (1, 2, 3, 4))
+        shares = [sum(n for (_, s), n in got.items() if s == system) for system in (1, 2, 3, 4)]
+        assert min(shares) > 0.5 * max(shares), "none takes all"
+    sky.push(ground(dialect.MAVLink_param_set_message(2, 191, b"MMAG_HDG_RATE", 7.0, 9)), stations[0])
+    sky.run(0.1)
+    last = [m for m in sky.link.sent[stations[0]][-20:] if m.get_type() == "PARAM_VALUE"]
+    assert [m.param_value for m in last if m.param_id == "MMAG_HDG_RATE"][-1:] == [7.0], "a SET is echoed at once"
 
 
 def test_a_question_to_one_is_answered_by_that_one_on_the_askers_route(tmp_path: Path) -> None:

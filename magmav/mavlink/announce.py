@@ -37,7 +37,6 @@ class Announcer:
     def __init__(self, budget: Budget, heading_hz: float = 2.0) -> None:
         self.counts: Counter[str] = Counter()
         self._budget = budget
-        self._share = Budget(max(budget.bps / 2, 100.0))  # headings leave half for texts and parameters
         self.rate(heading_hz)
         self._headings: dict[int, _Heading] = {}
         self._due_ns: dict[int, int] = {}
@@ -49,7 +48,6 @@ class Announcer:
         """How often each heading is sent; 0 for not at all."""
         if not 0 <= heading_hz <= 50:
             raise ValueError(f"heading_hz: want 0 (off) to 50 Hz, got {heading_hz!r}")
-        self._share.rate(max(self._budget.bps / 2, 100.0))  # the budget may have another rate by now
         self._period_ns = round(_SECOND / heading_hz) if heading_hz else 0
 
     def heading(self, compass: int, degrees: float, boot_ns: int, now_ns: int) -> None:
@@ -110,7 +108,8 @@ class Announcer:
         if not self._period_ns or held.sent or stale or now_ns < due_ns:
             return []
         message = dialect.MAVLink_named_value_float_message(held.boot_ms, _NAMES[compass], held.degrees)
-        if not (self._budget.has(message, now_ns) and self._share.take(message, now_ns)):
+        share = self._budget.half()  # headings leave half for texts and parameters
+        if not (self._budget.has(message, now_ns) and share.take(message, now_ns)):
             return []
         self._budget.take(message, now_ns)
         held.sent = True

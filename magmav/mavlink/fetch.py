@@ -7,7 +7,7 @@ loss each way, one name in fifteen gets no answer to four requests, and without 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -33,13 +33,19 @@ class _Name:
 
 
 class ParamFetch:
-    """names : parameters of the autopilot. The values themselves are for whoever decodes PARAM_VALUE."""
+    """names : parameters of the autopilot. The values themselves are for whoever decodes PARAM_VALUE.
 
-    def __init__(self, names: Sequence[str], presence: Presence) -> None:
+    room : whether something may be asked now; it is asked when something is due.
+    """
+
+    def __init__(
+        self, names: Sequence[str], presence: Presence, room: Callable[[int], bool] = lambda now_ns: True
+    ) -> None:
         for name in names:
             if not 1 <= len(name) <= 16 or not name.isascii():
                 raise ValueError(f"names: {name!r} is no parameter name of 1 to 16 characters")
         self._presence = presence
+        self._room = room
         self._state = {name: _Name() for name in names}
         self._next_ns = 0
         self._key: tuple[int, int, str, int] | None = None
@@ -105,6 +111,8 @@ class ParamFetch:
             if state.tries == TRIES and not state.absent:
                 state.absent, state.due_ns = True, now_ns + LATE_NS
                 continue
+            if not self._room(now_ns):
+                return []
             state.tries += 1
             late = state.tries - TRIES
             pause_ns = RETRY_NS if late <= 0 else min(LATE_NS << late, LAST_PAUSE_NS)

@@ -81,7 +81,7 @@ class FileServer:
         who, answer = due
         payload = list(answer.ljust(_HEAD + _DATA, b"\0"))
         message = dialect.MAVLink_file_transfer_protocol_message(0, *who[:2], payload)
-        if not self._budget.has(message, now_ns, reserve=self._budget.reserve):
+        if not self._budget.has(message, now_ns, self._budget.reserve, who[2]):
             return []
         if due is self._away:
             self._away = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -48,11 +48,17 @@ class _Stream:
 
 
 class Intervals:
-    """wanted : message name -> Hz. ``rates`` tells what really comes, over the last five seconds."""
+    """wanted : message name -> Hz. ``rates`` tells what really comes, over the last five seconds.
 
-    def __init__(self, wanted: Mapping[str, float], presence: Presence) -> None:
+    room : whether something may be asked now; it is asked when something is due.
+    """
+
+    def __init__(
+        self, wanted: Mapping[str, float], presence: Presence, room: Callable[[int], bool] = lambda now_ns: True
+    ) -> None:
         self._wanted = _checked(wanted)
         self._presence = presence
+        self._room = room
         self._key: tuple[int, int, str, int] | None = None
         self.restart()
 
@@ -128,7 +134,7 @@ class Intervals:
                 self._queue.appendleft(self._waiting)
             self._waiting = ""
         name = next((n for n in self._queue if self._may_ask(self._streams[n], now_ns)), None)
-        if name is None:
+        if name is None or not self._room(now_ns):
             return []
         self._queue.remove(name)
         return [self._request(autopilot, name, now_ns)]

@@ -89,7 +89,7 @@ class ParamServer:
                 break
             index, route = (self._list_at, "") if single is None else single
             message = self._value(index)
-            if not self._budget.take(message, now_ns, reserve=self._budget.reserve):
+            if not self._budget.take(message, now_ns, self._budget.reserve, route):
                 break
             if single is None:
                 self._list_at += 1
@@ -184,7 +184,7 @@ class ParamServer:
         answer = dialect.MAVLink_param_error_message(*sender, name, index, error)
         if self._budget.debt(now_ns) > _MOST_DEBT_S * self._budget.bps:
             return []
-        self._budget.force(answer, now_ns)
+        self._budget.force(answer, now_ns, route)
         return [Outgoing(answer, route)]
 
     def _value(self, index: int, value: float | None = None) -> Message:
