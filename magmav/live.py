@@ -8,11 +8,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
 from magmav.companion import MagCompanion, wanted_rates
 from magmav.core.types import Change, FieldModel, Reason, UploadResult
 from magmav.dry import every_message
 from magmav.link import Link
-from magmav.mavlink.autopilot.ardupilot import offset_names
+from magmav.mavlink.autopilot.adapter import ADAPTERS, adapter_of
 from magmav.mavlink.change import CONFIRM_ABOVE_MG, adapter_for, code_needed, largest_step_mg
 from magmav.mavlink.kept import Keeping
 from magmav.mavlink.signing import Signing
@@ -143,7 +145,8 @@ def _nobody(session: Session, compass: int, link: Link) -> Result:
         if refused:
             raise NoVehicle(f"{link.name}: {refused} messages came, none signed with this key; check --key-file")
         raise NoVehicle(f"{link.name}: no autopilot heard; is the vehicle on, and does it send to this link?")
-    names = ", ".join(offset_names(compass))
+    adapter = adapter_of(presence.autopilot.kind) or ADAPTERS[dialect.MAV_AUTOPILOT_ARDUPILOTMEGA]
+    names = ", ".join(adapter.offset_names(compass))
     return {
         "result": "REFUSED",
         "compass": compass,
