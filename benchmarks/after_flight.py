@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from estimator_bench.running import TICK_S, tape
+from estimator_bench.running import tape
 from estimator_bench.scenarios import STEP_AT_S, Scenario, chosen
 from estimator_bench.telemetry import BOOT_S, Flight, fly
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def live(samples: Sequence[Sample]) -> Iterator[tuple[int, Estimate]]:
     for s in samples:
         estimator.step(s)
         if s.boot_ns >= due_ns:
-            due_ns = s.boot_ns + int(TICK_S * 1e9)
+            due_ns = s.boot_ns + 1_000_000_000
             e = estimator.estimate(None)
             if e is not None:
                 yield s.boot_ns, e

@@ -20,7 +20,7 @@ from estimator_bench import peers
 from estimator_bench.flights import true_flight
 from estimator_bench.peer_runs import NAMES, Ready, peer_scores
 from estimator_bench.pins import IRON_MG, pins, tumble
-from estimator_bench.running import Run, Tick, run, tape
+from estimator_bench.running import TICK_S, Run, Tick, run, tape
 from estimator_bench.scenarios import SCENARIOS
 from estimator_bench.score import (
     HEADINGS_RAD,
@@ -92,7 +92,10 @@ def test_a_liar_is_found_out(flown):
     x, y, z = (-off).tolist()
     lies = [Tick(t.t_s, _with(e, off), (x, y, z), (0.01, 0.01, 0.01), True) for t in honest.ticks]
     got = score(flight, heard, Run("liar", lies, 1.0, 1.0))
-    assert got.ready_wrong == got.ready_beyond == got.ready_seconds == len(lies)
+    assert got.ready_wrong == got.ready_beyond == got.ready_seconds
+    assert got.ready_seconds == pytest.approx(lies[-1].t_s - lies[0].t_s + TICK_S)
+    rare = score(flight, heard, Run("liar", lies[::5], 1.0, 1.0))  # a tick counts for as long as it stood
+    assert rare.ready_seconds == pytest.approx(lies[::5][-1].t_s - lies[0].t_s + TICK_S)
     assert summed([got]).wrong_share == 1.0
     assert summed([got]).ratio > 100.0 and summed([got]).nees > 100.0
 

@@ -129,15 +129,19 @@ def test_the_doubt_is_one_up_to_its_line_and_then_steep_enough_that_the_pull_fal
 
 
 def test_where_soft_iron_is_believed_the_second_is_doubted_unless_the_tilt_is_its_own():
-    """As one number by which its whole covariance grows."""
+    """As one number by which its whole covariance grows; where the tilt is its own, it is the bank that is doubted."""
     mean, p, take, theirs, iron = two(7, 1.0)
     before = take @ p @ take.T
 
     def times(model, own_tilt):
         e = joining(Said(iron, theirs), model)
         e._own_tilt = own_tilt
-        after = e._joined(mean, take, p @ take.T, before, before, EXPECTED)[1]
-        much = np.linalg.solve(theirs, np.linalg.inv(np.linalg.inv(after) - np.linalg.inv(before)))
+        got, after, _, apart = e._joined(mean, take, p @ take.T, before, before, EXPECTED)
+        assert apart == pytest.approx(1.0)  # neither doubt makes them agree any better
+        mine = Tuning().own_tilt_joined * before if own_tilt else before
+        much = np.linalg.solve(theirs, np.linalg.inv(np.linalg.inv(after) - np.linalg.inv(mine)))
+        pulled = mine @ np.linalg.solve(mine + much[0, 0] * theirs, iron - take @ mean)
+        assert take @ (got - mean) == pytest.approx(pulled, rel=1e-4)
         assert much == pytest.approx(much[0, 0] * np.eye(3), abs=1e-5 * much[0, 0])
         return float(much[0, 0])
 

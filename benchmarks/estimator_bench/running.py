@@ -20,7 +20,8 @@ from magmav.pipeline import Pipeline
 from magmav.settings import Settings, with_value
 from magmav.vehicle import new_channel
 
-TICK_S = 1.0
+TICK_S = 0.2
+"""The channel makes a new answer this often."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +113,7 @@ def run(
             x, y, z = finding.offsets_mg.tolist()
             sx, sy, sz = finding.sigma_mg.tolist()
             ticks.append(Tick(one.t_s, known, (x, y, z), (sx, sy, sz), finding.verdict.state is State.READY))
-            due = (int(one.t_s / TICK_S + 0.02) + 1) * TICK_S
+            due = (int(one.t_s / TICK_S + 0.1) + 1) * TICK_S
     late_n = max(len(heard) - early_n, 1)
     late_us = 1e6 * (made[-1].spent_s - early_s) / late_n
     return Run(name, ticks, late_us, 1e6 * early_s / early_n)

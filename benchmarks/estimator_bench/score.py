@@ -8,14 +8,16 @@ calibration costs later, whatever is flown then. ``full`` uses all the estimator
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimator_bench.motions import Array
-from estimator_bench.running import Heard, Run, Tick
+from estimator_bench.running import TICK_S, Heard, Run, Tick
 from estimator_bench.scenarios import STEP_AT_S
 from estimator_bench.telemetry import Flight
 from magmav.core.correction import corrected_field
@@ -29,7 +31,7 @@ NEVER = math.inf
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One second of one run. Degrees and mG; the error is 180 / sqrt 3 (any heading) while nothing is known."""
+    """One tick of one run. Degrees and mG; the error is 180 / sqrt 3 (any heading) while nothing is known."""
 
     t_s: float
     full_deg: float
@@ -43,7 +45,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """One run. Errors are at CHECKPOINTS_S; times s of flight, inf for never; counts are seconds."""
+    """One run. Errors are at CHECKPOINTS_S; times s of flight, inf for never."""
 
     name: str
     scenario: str
@@ -56,9 +58,9 @@ class Scored:
     to_one_degree_s: float
     again_s: float | None  # after the step of the iron, to one degree again
     ready_s: float  # after take-off
-    ready_seconds: int
-    ready_wrong: int  # more than WRONG_DEG off
-    ready_beyond: int  # beyond three claimed sigma of heading
+    ready_seconds: float
+    ready_wrong: float  # more than WRONG_DEG off
+    ready_beyond: float  # beyond three claimed sigma of heading
     us_per_sample: float
     us_first_20s: float
 
@@ -149,6 +151,11 @@ def score(flight: Flight, heard: list[Heard], run: Run) -> Scored:
     before = [m for m in moments if m.t_s < STEP_AT_S] if step else moments
     after = [m for m in moments if m.t_s >= STEP_AT_S]
     ready = [m for m in moments if m.ready]
+    lasts = [b.t_s - a.t_s for a, b in pairwise(moments)] + [TICK_S]
+
+    def seconds(beyond: Callable[[Moment], bool]) -> float:
+        return sum(dt_s for m, dt_s in zip(moments, lasts, strict=True) if m.ready and beyond(m))
+
     return Scored(
         name=run.name,
         scenario=flight.scenario.name,
@@ -161,9 +168,9 @@ def score(flight: Flight, heard: list[Heard], run: Run) -> Scored:
         to_one_degree_s=settled(before),
         again_s=settled(after) - STEP_AT_S if step else None,
         ready_s=ready[0].t_s - flight.truth.takeoff_s if ready else NEVER,
-        ready_seconds=len(ready),
-        ready_wrong=sum(m.full_deg > WRONG_DEG for m in ready),
-        ready_beyond=sum(m.full_deg > 3.0 * m.heading_sigma_deg for m in ready),
+        ready_seconds=seconds(lambda m: True),
+        ready_wrong=seconds(lambda m: m.full_deg > WRONG_DEG),
+        ready_beyond=seconds(lambda m: m.full_deg > 3.0 * m.heading_sigma_deg),
         us_per_sample=run.us_per_sample,
         us_first_20s=run.us_first_20s,
     )
@@ -206,9 +213,9 @@ def score_answers(flight: Flight, name: str, answers: list[tuple[float, Answer |
         to_one_degree_s=settled(before) if often else math.nan,
         again_s=settled(after) - STEP_AT_S if step and often else None,
         ready_s=NEVER,
-        ready_seconds=0,
-        ready_wrong=0,
-        ready_beyond=0,
+        ready_seconds=0.0,
+        ready_wrong=0.0,
+        ready_beyond=0.0,
         us_per_sample=math.nan,
         us_first_20s=math.nan,
     )
@@ -254,7 +261,7 @@ class Summary:
     again_s: float | None  # median
     ready_within_60s: float  # share of flights
     ready_s: float  # median
-    ready_seconds: int
+    ready_seconds: float
     wrong_share: float  # of ready seconds
     beyond_share: float
     us_per_sample: float

@@ -190,7 +190,7 @@ class AdaptiveEstimator:
         """Where the second opinion is another, let it compete: the bank may have gone astray."""
         bank, second = self._bank, self._second
         said = None if second is None else second.opinion(None)
-        if bank is None or second is None or said is None or stale(second, self._change.since_s):
+        if bank is None or second is None or said is None or self._is_stale():
             return
         mean, covariance = bank.mixture()
         take, theirs_mg2 = self._take(), known(said.covariance_mg2) + self._motors_mg2(mean)
@@ -272,8 +272,7 @@ class AdaptiveEstimator:
             return None
         said = None if self._second is None else self._second.opinion(expected)
         level = self._tilting.rms_rad < self.tuning.least_tilt_rad  # it may be the attitude's own noise that tilts
-        old = self._second is not None and stale(self._second, self._change.since_s)
-        rests_on = (self._learnt, said, old, level, expected is None)
+        rests_on = (self._learnt, said, self._is_stale(), level, expected is None)
         if self._answered is None or self._answered[0] != rests_on:
             self._answered = rests_on, self._answer(self._bank, expected, level)
         return replace(self._answered[1], samples=self._samples)
@@ -300,7 +299,10 @@ class AdaptiveEstimator:
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
         mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
-        soft = _EYE3 + soft_matrix(mean[at.S])
+        soft = np.linalg.inv(_EYE3 + soft_matrix(mean[at.S]))
+        said = None if self._second is None else self._second.opinion(expected)
+        if self._own_tilt and said is not None and not self._is_stale():
+            soft = said.soft_iron_b  # a wrong tilt looks like soft iron to the bank
         return Estimate(
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
             covariance_mg2=iron_mg2,
@@ -312,13 +314,16 @@ class AdaptiveEstimator:
             samples=self._samples,
             changed_ago_s=self._change.since_s,
             delay_s=float(mean[at.T]),
-            soft_iron_b=mat3(np.linalg.inv(soft), "soft iron"),
+            soft_iron_b=mat3(soft, "soft iron"),
             says_b=(True, True, self._axes == 3),
             throttle_b_mg=vec3(mean[at.K], "throttle"),
             throttle_mean=self._drives[0] + 0.5,
             floor_mg=_FLOOR_MG,
             apart=max(apart, _FIELD_APART * field_apart),
         )
+
+    def _is_stale(self) -> bool:
+        return self._second is not None and stale(self._second, self._change.since_s)
 
     def _take(self) -> Array:
         """What makes of a state the iron at mean throttle, (3, n)."""
@@ -343,10 +348,13 @@ class AdaptiveEstimator:
             return mean, iron_mg2, own_mg2, 0.0
         off = said.hard_iron_b_mg - take @ mean
         apart = distance(off, iron_mg2, said.covariance_mg2)
-        if stale(second, self._change.since_s):
+        if self._is_stale():
             return mean, iron_mg2, own_mg2, apart
         much = doubt(apart)
-        if not self._own_tilt:  # a wrong tilt looks like soft iron to the bank
+        if self._own_tilt:
+            less = self.tuning.own_tilt_joined
+            pulled, iron_mg2, own_mg2 = less * pulled, less * iron_mg2, less * own_mg2
+        else:
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
         motors = self._motors_mg2(mean)
         weight = np.linalg.inv(iron_mg2 + much * known(said.covariance_mg2) + motors)
