@@ -23,6 +23,8 @@ _WHERE = {
     "replay": "magmav.recording",
     "NothingToLearnFrom": "magmav.recording",
     "open_recording": "magmav.recording",
+    "fit": "magmav.fitting",
+    "FitOptions": "magmav.fitting",
     "Settings": "magmav.settings",
     "load_settings": "magmav.settings",
     "world_magnetic_model": "magmav.geomag",

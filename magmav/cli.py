@@ -94,6 +94,9 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument("--plot", type=Path, metavar="PNG", help="circles and spheres over the points")
     compare.add_argument("--seed", type=int, metavar="N", help="of a scenario, instead of its own")
 
+    fit = add("fit", "best answer after the flight, as parameter file, report and JSON", place=True, bench=True)
+    _fit_options(fit)
+
     upload = add("upload", "write what was learnt to the vehicle, prove it, or show what would be sent", store=True)
     _link(upload)
     _write_options(upload)
@@ -112,6 +115,20 @@ def parser() -> argparse.ArgumentParser:
 
     add("settings", "print every setting with its default, unit and limits, as TOML")
     return top
+
+
+def _fit_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("logs", type=Path, metavar="LOG", nargs="+", help="a .tlog, .bin, .log or .ulg, or a folder")
+    sub.add_argument("--reference", type=Path, metavar="CSV", help="truth file instead of the recording's own yaw")
+    sub.add_argument("--soft-iron", action="store_true", help="soft iron too, where the flight shows it")
+    sub.add_argument("--scale", action="store_true", help="scale too, where the flight shows it")
+    sub.add_argument("--motor", action="store_true", help="motor or current terms too, where the flight shows them")
+    sub.add_argument("--params", type=Path, metavar="FILE", help="what changes: .param, or .params for QGC")
+    sub.add_argument("--report", type=Path, metavar="HTML", help="one file to show; of one log")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="files of every log, and a table of all")
+    sub.add_argument("--jobs", type=int, metavar="N", help="processes for many logs (default: all cores)")
+    sub.add_argument("--dask", metavar="ADDRESS", help="an existing Dask cluster instead, for many logs")
+    sub.add_argument("--resume", action="store_true", help="leave out what the ledger in --out says is done")
 
 
 def _link(sub: argparse.ArgumentParser, several: bool = False) -> None:
@@ -175,7 +192,7 @@ def _guarded(options: argparse.Namespace) -> int:
     ) as error:  # fmt: skip
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
-        return fail(INPUT if options.command in ("replay", "compare") else PORT, str(error), options.json)
+        return fail(INPUT if options.command in ("replay", "compare", "fit") else PORT, str(error), options.json)
     except (NoVehicle, DemoError) as error:
         return fail(PORT, str(error), options.json)
     except Refused as error:

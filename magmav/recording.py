@@ -146,10 +146,12 @@ def replay(
     references: dict[int, Reference] | None = None,
     stop: Callable[[], bool] = lambda: False,
     tap: Tap | None = None,
+    boots: dict[int, Vehicle | Boot] | None = None,
 ) -> Result:
     """Run a recording to its end; the result is the JSON document that ``magmav replay --json`` prints.
 
     references : filled with what each system was scored against, for pictures.  tap : see vehicle.Tap.
+    boots : filled with each system's boot that the result is about.
     Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
     """
     truth = None if reference_csv is None else Reference.from_csv(reference_csv)
@@ -172,6 +174,8 @@ def replay(
         if references is not None and reference is not None:
             references[system] = reference
         boot = earlier.get(system, vehicle)
+        if boots is not None:
+            boots[system] = boot
         compasses = [
             describe(log, boot, reference, learn_for_s, settings.heading.smooth)
             for (s, _), log in sorted(keeper.compasses.items())

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 
 from magmav.commands.common import Refused as Refused
+from magmav.commands.fit import fit
 from magmav.commands.live import history, restore, run, upload
 from magmav.commands.other import demo, settings
 from magmav.commands.recordings import compare, replay
@@ -15,6 +16,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": run,
     "replay": replay,
     "compare": compare,
+    "fit": fit,
     "upload": upload,
     "restore": restore,
     "history": history,

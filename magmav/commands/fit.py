@@ -1,0 +1,38 @@
+"""magmav fit: the best answer after the flight."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from magmav.commands.common import progress_bar, settings_of, show
+from magmav.settings import SettingsError
+
+
+def fit(o: argparse.Namespace) -> int:
+    """One log or many."""
+    from magmav.fitting import FitOptions
+    from magmav.fitting import fit as run
+    from magmav.view.fit import fit_view
+
+    settings = settings_of(o)
+    options = FitOptions(o.soft_iron, o.motor, o.scale, None if o.reference is None else str(o.reference))
+    if o.params is not None and len(o.logs) != 1:
+        raise SettingsError("--params: one file is for one log; give --out DIR for several")
+    entries: list[dict[str, Any]] = []
+    for path in o.logs:
+        with ExitStack() as stack:
+            entries.append(run(path, settings, options=options, progress=progress_bar(stack, path.name)))
+    if o.params is not None:
+        write_parameters(entries[0], o.params)
+    show(o, {"logs": entries}, fit_view)
+    return 0
+
+
+def write_parameters(entry: dict[str, Any], path: Path) -> None:
+    """What changed, as the file's ending says: .params for QGroundControl, else NAME,VALUE."""
+    from magmav.fitting.parameters import file_of
+
+    path.write_text(file_of(entry, path.suffix), encoding="utf-8")
