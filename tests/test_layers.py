@@ -42,7 +42,8 @@ STOREYS = {
     "magmav.link": (("magmav.link",), None),
     # core.reasons is the part of core.types that holds the one vocabulary.
     "magmav.mavlink": (("magmav.mavlink", *CORE_FOR_READERS), None),
-    "magmav.logs": (("magmav.logs", *CORE_FOR_READERS), None),
+    # A .tlog is a link's bytes, and read by columns it must give what link and codec give one by one.
+    "magmav.logs": (("magmav.logs", "magmav.link", "magmav.mavlink.codec", *CORE_FOR_READERS), None),
     "magmav.view": (("magmav.view", "magmav.core.types", "magmav.core.reasons"), None),
     "magmav_sim": (("magmav_sim", "magmav.link", "magmav.mavlink.codec"), None),
 }

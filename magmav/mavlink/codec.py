@@ -79,6 +79,11 @@ class Codec:
         # SETUP_SIGNING carries a key: nobody here has any business with it (S17).
         self._wanted = {i for i, k in kinds if (wanted is None or k.msgname in wanted) and k.msgname != "SETUP_SIGNING"}
 
+    @property
+    def seeds(self) -> dict[int, int]:
+        """By message number the byte of its own that each checksum ends with."""
+        return {number: seed[0] for number, seed in self._seeds.items()}
+
     def decode(self, data: bytes, route: str, *, whole: bool) -> list[Message]:
         """Messages completed by these bytes. ``whole``: a datagram, nothing is carried over to the next.
 
