@@ -1,0 +1,238 @@
+"""The section of one compass: verdict, causes, what to do, values, how good they are, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from magmav.view import report_charts as charts
+from magmav.view.report_page import AXIS_NAMES, Child, Markup, bullets, exact, facts, number, table, tag, word
+from magmav.view.report_words import AUTOPILOTS, AXES, lines, meaning, title_of, to_do
+
+Json = Mapping[str, Any]
+
+_WAYS = {
+    "uncalibrated": "no calibration at all",
+    "before": "as stored",
+    "after": "new offsets",
+    "full": "with soft iron and motor terms",
+    "path": "iron of each moment, soft iron",
+}
+_PARTS = {"soft_iron": "soft iron", "motor": "motor and current", "scale": "scale"}
+
+
+def compass_section(vehicle: Json, compass: Json, anchor: str, first: bool) -> Markup:
+    """Everything about one compass. anchor: the id links point at; first: the first of the page."""
+    fit = compass.get("fit")
+    device = (fit or {}).get("device_id") or compass.get("device_id")
+    name = f"Compass {word(compass.get('compass'))} of system {word(vehicle.get('system'))}"
+    return tag(
+        "section",
+        tag("h2", f"{name}, device {word(device)}"),
+        _verdict(compass),
+        () if fit is None else _of_fit(fit),
+        _live(compass),
+        id=anchor,
+        class_="compass first" if first else "compass",
+    )
+
+
+def _verdict(compass: Json) -> Markup:
+    told = compass.get("fit") or compass
+    state = str(told.get("state"))
+    style = state if state in ("READY", "LEARNING", "REFUSED", "NO_DATA") else "NO_DATA"
+    parts: list[Child] = [tag("p", tag("strong", title_of(told.get("state")), "."), " ", " ".join(meaning(compass)))]
+    for title, found in (
+        ("Why", bullets(lines(told.get("reasons")))),
+        ("What is wrong, and by which figure", bullets(lines(told.get("causes")))),
+        ("What to do", bullets(to_do(compass))),
+    ):
+        if found is not None:
+            parts += [tag("h3", title), found]
+    return tag("div", parts, class_=f"verdict {style}")
+
+
+def _of_fit(fit: Json) -> list[Child]:
+    series, cut = fit.get("series") or {}, fit.get("cut") or []
+    heading = fit.get("heading") or {}
+    pictures = [
+        charts.deviation(fit.get("deviation") or []),
+        charts.coverage(fit.get("coverage") or {}),
+        charts.field(series, cut),
+        charts.heading(series, cut, heading.get("reference")),
+        charts.offsets(series, cut, fit.get("new_offsets_mg")),
+    ]
+    return [
+        tag(
+            "div",
+            tag("div", _values(fit)),
+            tag("div", _parameters(fit.get("parameters") or {})),
+            tag("div", _misfit(fit)),
+            tag("div", _heading(fit.get("heading"))),
+            class_="pair",
+        ),
+        tag("div", pictures, class_="pictures"),
+        _card(fit.get("deviation") or []),
+        _spans(fit),
+        _beyond(fit),
+    ]
+
+
+def _values(fit: Json) -> list[Child]:
+    rows: list[Sequence[Child]] = [
+        (name, *(number(_item(fit.get(key), i), form) for i in range(3))) for name, key, form in _ROWS
+    ]
+    axes = [str(_item(fit.get("axes"), i)) for i in range(3)]
+    rows.append(("how it is known", *(tag("span", AXES.get(axis, axis)) for axis in axes)))
+    note = (
+        "Body axes, mG, as ArduPilot would add them. Hard iron is what the sensor itself carries, with no current "
+        "flowing, and is subtracted."
+    )
+    if fit.get("relative"):
+        note += " Relative: add the change to what is stored; the values to store are not known."
+    return [tag("h3", "Offsets"), table(("mG", *AXIS_NAMES), rows), tag("p", note, class_="quiet")]
+
+
+_ROWS = (
+    ("stored", "old_offsets_mg", ".1f"),
+    ("new", "new_offsets_mg", ".1f"),
+    ("change", "change_mg", "+.1f"),
+    ("one sigma", "sigma_mg", ".1f"),
+    ("hard iron", "hard_iron_mg", ".1f"),
+)
+
+
+def _parameters(named: Json) -> list[Child]:
+    old, new, changed = (named.get(k) or {} for k in ("old", "new", "changed"))
+    names = list(dict.fromkeys((*new, *changed, *old)))
+    kind = str(named.get("autopilot"))
+    kind = {name.lower(): name for name in AUTOPILOTS.values()}.get(kind, word(named.get("autopilot")))
+    title = tag("h3", f"Parameters of the autopilot ({kind})")
+    if not names:
+        return [title, tag("p", "No parameter is to be changed, or which ones belong to this compass is not known.")]
+    rows = [
+        (n, exact(old.get(n)), exact(changed.get(n, new.get(n))), tag("span", "write" if n in changed else "stays"))
+        for n in names
+    ]
+    return [title, table(("parameter", "stored", "new", ""), rows, changed=[n in changed for n in names])]
+
+
+def _misfit(fit: Json) -> list[Child]:
+    left = fit.get("residual_mg") or {}
+    rows = [
+        (name, number(left.get(f"{part}before"), ".2f"), number(left.get(f"{part}after"), ".2f"))
+        for name, part in (("all that was used", ""), ("held out: not seen by its fit", "held_out_"))
+    ]
+    return [tag("h3", "Misfit of the field, RMS, mG"), table(("samples", "as stored", "new"), rows)]
+
+
+def _heading(heading: Json | None) -> list[Child]:
+    if not heading:
+        title = tag("h3", "Heading error")
+        return [title, tag("p", "Heading error: not known, there is no reference to measure it against.")]
+    held = heading.get("held_out") or {}
+    scores = [(_WAYS.get(k, k), v) for k, v in heading.items() if isinstance(v, Mapping) and k != "held_out"]
+    scores += [(f"held out: {_WAYS.get(k, k)}", v) for k, v in held.items() if isinstance(v, Mapping)]
+    rows = [
+        (name, number(s.get("rms_deg"), ".2f"), number(s.get("p95_deg"), ".2f"), number(s.get("n"), "d"))
+        for name, s in scores
+    ]
+    reference = word(heading.get("reference"))
+    how = f"Held out: {held['how']}." if held.get("how") else "No part of the flight was held out."
+    if reference.startswith("ATTITUDE"):
+        how += " Yaw of an autopilot usually follows its own compass: agreeing with it proves little."
+    head = ("calibration", "RMS", "95 % within", "samples")
+    title = tag("h3", f"Heading error against {reference}, degrees")
+    return [title, table(head, rows), tag("p", how, class_="quiet")]
+
+
+def _card(card: Sequence[Json]) -> list[Child]:
+    if not card:
+        return [tag("p", "Deviation card: not known, so little level field is left that no heading shows.")]
+    rows = []
+    for i, row in enumerate(card):
+        after, sigma = row.get("after_deg"), row.get("sigma_deg")
+        told = number(after, "+.2f") if sigma is None else f"{number(after, '+.2f')} \u00b1 {number(sigma, '.2f')}"
+        heading = f"{charts.POINTS[i % 8]} {number(row.get('heading_deg'), '.0f')}"
+        rows.append((heading, number(row.get("before_deg"), "+.2f"), told))
+    note = "A level vehicle, shown less true heading, degrees; after has one sigma. Magnetic headings."
+    return [table(("heading", "as stored", "new offsets"), rows, "Deviation card"), tag("p", note, class_="quiet")]
+
+
+def _spans(fit: Json) -> list[Child]:
+    span = fit.get("span_s") or (None, None)
+    used = f"Samples from {number(_item(span, 0), '.1f')} to {number(_item(span, 1), '.1f')} s since boot were used."
+    cut = fit.get("cut") or []
+    out: list[Child] = [tag("h3", "Time span"), tag("p", used, None if cut else " Nothing inside was left out.")]
+    if cut:
+        rows = [
+            (
+                f"{number(c.get('from_s'), '.1f')} to {number(c.get('to_s'), '.1f')}",
+                tag("span", f"{word(c.get('text'))} ({word(c.get('code'))})"),
+            )
+            for c in cut
+        ]
+        out.append(table(("left out, s", tag("span", "why")), rows))
+    return out
+
+
+def _beyond(fit: Json) -> list[Child]:
+    """Mounting, and what was asked for beyond offsets."""
+    mounting = fit.get("mounting") or {}
+    found = mounting.get("found")
+    told = "no error found"
+    if found:
+        turn, rotation = number(found.get("angle_deg"), ".1f"), word(found.get("rotation"))
+        told = f"{word(found.get('text'))}: {turn} degrees, as rotation {rotation}"
+    pairs: list[tuple[str, Child]] = [
+        ("mounting", told),
+        ("orientation stored", word(mounting.get("stored_orientation"))),
+        ("the bad one on board", "yes, of the compasses it fits the motion worst" if fit.get("odd_one_out") else "no"),
+    ]
+    for key, name in _PARTS.items():
+        pairs.append((name, _part(fit.get(key))))
+    return [tag("h3", "Mounting and terms beyond offsets"), facts(pairs)]
+
+
+def _part(part: Any) -> str:
+    """Asked and earned first, because a term that is not earned is not used."""
+    if not isinstance(part, Mapping):
+        return "not fitted"
+    earned = "earned" if part.get("earned") else "not earned, not used"
+    asked = "asked for" if part.get("asked") else "not asked for"
+    rest = "; ".join(f"{k.replace('_', ' ')}: {word(v)}" for k, v in part.items() if k not in ("asked", "earned"))
+    return f"{asked}, {earned}. {rest}"
+
+
+def _live(compass: Json) -> list[Child]:
+    """What the service would have known in flight: the rest of the entry."""
+    heading, only = (compass.get(k) or {} for k in ("heading", "heading_offsets_only"))
+    offsets, sigma = compass.get("offsets_mg"), compass.get("sigma_mg")
+    pairs: list[tuple[str, Child]] = [("state at the end", title_of(compass.get("state")))]
+    if compass.get("reasons"):
+        pairs.append(("why", bullets(lines(compass["reasons"]))))
+    pairs.append(("offsets, mG", _three(offsets, sigma)))
+    if compass.get("offsets_change_mg") is not None:
+        pairs.append(("change of offsets, mG", _three(compass["offsets_change_mg"], sigma)))
+    pairs.append(("samples", f"{word(compass.get('samples'))}, {word(compass.get('samples_learnt'))} of them taught"))
+    if heading.get("reference") is not None:
+        told = f"{number(heading.get('rms_deg'), '.2f')} deg RMS with the full model"
+        told += f", {number(only.get('rms_deg'), '.2f')} with offsets alone" if only else ""
+        pairs.append((f"heading against {word(heading['reference'])}", told))
+    stored = compass.get("stored") or {}
+    pairs.append(("the autopilot held", ", ".join(f"{k} {exact(v)}" for k, v in stored.items()) or word(None)))
+    return [tag("h3", "What the service would have known in flight"), facts(pairs)]
+
+
+def _three(values: Any, sigmas: Any) -> str:
+    if values is None:
+        return word(None)
+    out = []
+    for i, name in enumerate("xyz"):
+        sigma = _item(sigmas, i)
+        out.append(f"{name} {number(_item(values, i))}" + ("" if sigma is None else f" \u00b1 {number(sigma)}"))
+    return ", ".join(out)
+
+
+def _item(values: Any, index: int) -> Any:
+    return values[index] if values is not None and index < len(values) else None
