@@ -121,7 +121,7 @@ def describe(
         "state": last.verdict.state.name,
         "reasons": [{"code": r.name, "text": r.text} for r in last.verdict.reasons],
         "causes": [cause.as_json() for cause in vehicle.causes.of(compass)],
-        "deviation_card": _card(last, vehicle) if known else None,
+        "deviation_card": card(last, vehicle) if known else None,
         "heading": full,
         "heading_offsets_only": offsets_only,
         "heading_smoothed": smoothed_scores(log, reference) if smoothing != "off" else None,
@@ -132,7 +132,7 @@ def describe(
     }
 
 
-def _card(last: Record, vehicle: Vehicle | Boot) -> list[Result]:
+def card(last: Record, vehicle: Vehicle | Boot) -> list[Result]:
     """Eight headings, N to NW: heading error in degrees with its sigma, as stored, with new offsets, with the model."""
     e, held = last.estimate, vehicle.calibrations
     stored = held.offsets(last.compass)

@@ -109,7 +109,7 @@ def parser() -> argparse.ArgumentParser:
     _write_options(restore)
     restore.add_argument("--dry-run", action="store_true", help="show every message and send none")
 
-    history = add("history", "every write to a vehicle, and how it ended", store=True)
+    history = add("history", "every write to a vehicle, and what every flight taught", store=True)
     history.add_argument("--dismiss", type=int, metavar="ID", help="leave a write that was cut short as it is")
     history.add_argument("--limit", type=int, default=20, metavar="N", help="how many (default 20)")
 
@@ -125,10 +125,11 @@ def _fit_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--motor", action="store_true", help="motor or current terms too, where the flight shows them")
     sub.add_argument("--params", type=Path, metavar="FILE", help="what changes: .param, or .params for QGC")
     sub.add_argument("--report", type=Path, metavar="HTML", help="one file to show; of one log")
-    sub.add_argument("--out", type=Path, metavar="DIR", help="files of every log, and a table of all")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="ledger, and table of many logs (default: magmav-fit)")
     sub.add_argument("--jobs", type=int, metavar="N", help="processes for many logs (default: all cores)")
     sub.add_argument("--dask", metavar="ADDRESS", help="an existing Dask cluster instead, for many logs")
-    sub.add_argument("--resume", action="store_true", help="leave out what the ledger in --out says is done")
+    sub.add_argument("--resume", action="store_true", help="only go on from the ledger in --out")
+    sub.add_argument("--store", type=Path, metavar="FILE", help="remember what was learnt, for `magmav history`")
 
 
 def _link(sub: argparse.ArgumentParser, several: bool = False) -> None:
@@ -174,6 +175,8 @@ def _guarded(options: argparse.Namespace) -> int:
     from magmav_sim.scenario import ScenarioError
 
     from magmav.demo import DemoError
+    from magmav.fitting.cluster import ClusterError
+    from magmav.fitting.ledger import LedgerError
     from magmav.live import NoVehicle
     from magmav.logs import LogError
     from magmav.mavlink.signing import SigningError
@@ -188,12 +191,13 @@ def _guarded(options: argparse.Namespace) -> int:
     except (SettingsError, ValueError) as error:
         return fail(USAGE, str(error), options.json)
     except (
-        LogError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError, SigningError,
+        LogError, LedgerError, NothingToLearnFrom, SavedResultError, TruthError, ViewError, ScenarioError, StoreError,
+        SigningError,
     ) as error:  # fmt: skip
         return fail(INPUT, str(error), options.json)
     except LinkError as error:
         return fail(INPUT if options.command in ("replay", "compare", "fit") else PORT, str(error), options.json)
-    except (NoVehicle, DemoError) as error:
+    except (NoVehicle, DemoError, ClusterError) as error:
         return fail(PORT, str(error), options.json)
     except Refused as error:
         return fail(REFUSED, str(error), options.json)

@@ -17,6 +17,7 @@ from magmav.choices import Choices, beside
 from magmav.coaching import Coaching
 from magmav.core.types import Change, Reason, Record, State, Verdict
 from magmav.hearing import same_end
+from magmav.logbook import Logbook
 from magmav.mavlink.announce import Announcer
 from magmav.mavlink.autopilot.adapter import ADAPTERS, adapter_of
 from magmav.mavlink.budget import Budget
@@ -112,6 +113,7 @@ class MagCompanion:
             unix_offset_ns=unix_offset_ns,
             serves=serves,
         )
+        self._logbook = Logbook(store, unix_offset_ns, self.writer.plan)
         self._server = ParamServer(own, self.presence, self.budget, denied=self._denied)
 
     def _take_up(self) -> None:
@@ -242,6 +244,7 @@ class MagCompanion:
             self._said_ambiguous = True
             _log.warning("several vehicles %s; choose one with --system ID", self.presence.ambiguous)
         self._choices.poll(now_ns)
+        self._logbook.look(self.flown(), self._records, self.writer.vehicle)
         self._tell_sealed(now_ns)
         out = [] if self.sealed and self.job is None else self.writer.poll(now_ns)
         out += self.presence.poll(now_ns)

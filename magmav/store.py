@@ -22,18 +22,22 @@ from magmav.mavlink.kept import Keeping
 from magmav.mavlink.uid import may_be_same
 from magmav.store_rows import (
     ESTIMATE_COLUMNS,
+    LEARNT_COLUMNS,
     WRITE_COLUMNS,
+    Learnt,
     SavedEstimate,
     Write,
     estimate_of,
     estimate_row,
+    learnt_of,
+    learnt_row,
     pack,
     unpack,
     write_of,
 )
 from magmav.store_schema import StoreError, connect
 
-__all__ = ["SavedEstimate", "Store", "StoreBusy", "StoreError", "Write", "default_path"]
+__all__ = ["Learnt", "SavedEstimate", "Store", "StoreBusy", "StoreError", "Write", "default_path"]
 _KNOWN = (UploadResult.ALL_NEW, UploadResult.WRITTEN_UNPROVEN, UploadResult.ALL_OLD)
 _T = TypeVar("_T")
 
@@ -183,6 +187,23 @@ class Store:
         found = self._do(lambda db: db.execute(sql, (system, device_id)).fetchall())
         saved = (self._read(estimate_of, row) for row in found)
         return next((one for one in saved if not vehicle or may_be_same(one.vehicle, vehicle)), None)
+
+    # ------------------------------------------------------------ what flights taught
+
+    def learn(self, learnt: Sequence[Learnt]) -> None:
+        """Keep what a flight taught; told again of the same flight, the newer word takes the older one's place."""
+        sql = (
+            f"INSERT INTO learnt ({LEARNT_COLUMNS}, learnt) VALUES (?,?,?,?,?,?,?,?) "
+            "ON CONFLICT (source, origin, system, compass, device_id, vehicle) "
+            "DO UPDATE SET unix_ns=excluded.unix_ns, learnt=excluded.learnt"
+        )
+        rows = [learnt_row(one) for one in learnt]
+        self._do(lambda db: db.executemany(sql, rows))
+
+    def learnt(self) -> list[Learnt]:
+        """What every flight taught, the oldest first; those without a date before all others."""
+        sql = f"SELECT id, {LEARNT_COLUMNS}, learnt FROM learnt ORDER BY unix_ns, origin, system, compass"
+        return [self._read(learnt_of, row) for row in self._do(lambda db: db.execute(sql).fetchall())]
 
     # ------------------------------------------------------------ inside
 

@@ -46,7 +46,42 @@ class SavedEstimate:
     sigma_mg: tuple[float, float, float]
 
 
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """What one flight taught about one compass, whether it was written or not.
+
+    unix_ns : when it began, None where nobody knew the date.  device_id : 0 where it is not known.
+    source : "live" or "fit".  origin : what tells this flight from others: take-off time, or the recording's sha256.
+    old_offsets_mg, new_offsets_mg, change_mg, sigma_mg : (x, y, z), mG, body axes, as ArduPilot would add them; None
+    where the stored ones are not known.  old, new : the parameters a write would have changed.
+    card : (heading, error before, error after) of a level vehicle on eight headings, degrees.
+    heading : {"reference", "before_rms_deg", "after_rms_deg"} of the flight itself, where something measured it.
+    """
+
+    unix_ns: int | None
+    system: int
+    compass: int
+    device_id: int
+    vehicle: str
+    source: str
+    origin: str
+    name: str
+    state: str
+    reasons: tuple[str, ...]
+    axes: tuple[str, ...]
+    old_offsets_mg: tuple[float, ...] | None
+    new_offsets_mg: tuple[float, ...] | None
+    change_mg: tuple[float, ...] | None
+    sigma_mg: tuple[float, ...]
+    old: dict[str, float]
+    new: dict[str, float]
+    card: tuple[tuple[float | None, ...], ...] = ()
+    heading: dict[str, Any] | None = None
+    id: int = 0
+
+
 WRITE_COLUMNS = "id, unix_ns, vehicle, change, undoes, result, reasons, undone, boot_ms, kept"
+LEARNT_COLUMNS = "unix_ns, system, compass, device_id, vehicle, source, origin"
 ESTIMATE_COLUMNS = "unix_ns, vehicle, change, verdict, offsets_mg, sigma_mg"
 
 
@@ -89,6 +124,24 @@ def estimate_of(row: Sequence[Any]) -> SavedEstimate:
     x, y, z = (AxisState[name] for name in said["axes"])
     judged = Verdict(State[said["state"]], (x, y, z), tuple(Reason[name] for name in said["reasons"]))
     return SavedEstimate(unix_ns, vehicle, unpack(change), judged, _three(offsets_mg), _three(sigma_mg))
+
+
+def learnt_row(learnt: Learnt) -> tuple[Any, ...]:
+    """Values of LEARNT_COLUMNS, and the rest as JSON."""
+    held = asdict(learnt)
+    del held["id"]
+    return *(held.pop(name) for name in LEARNT_COLUMNS.split(", ")), json.dumps(held, allow_nan=False)
+
+
+def learnt_of(row: Sequence[Any]) -> Learnt:
+    """A row of id, LEARNT_COLUMNS and the JSON."""
+    number, *columns, text = row
+    rest = {k: _tuples(v) for k, v in json.loads(text).items()}
+    return Learnt(**dict(zip(LEARNT_COLUMNS.split(", "), columns, strict=True)), **rest, id=number)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _three(text: str) -> tuple[float, float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from pathlib import Path
 
-FORMAT = 2
+FORMAT = 3
 _WRITES = """
 CREATE TABLE writes (
     id INTEGER PRIMARY KEY, unix_ns INTEGER NOT NULL, system INTEGER NOT NULL, compass INTEGER NOT NULL,
@@ -21,8 +21,16 @@ CREATE TABLE estimates (
     PRIMARY KEY (system, device_id, vehicle)
 )
 """
+# What each flight taught, written to the vehicle or not. One row a flight, compass and source of it.
+_LEARNT = """
+CREATE TABLE learnt (
+    id INTEGER PRIMARY KEY, unix_ns INTEGER, system INTEGER NOT NULL, compass INTEGER NOT NULL,
+    device_id INTEGER NOT NULL, vehicle TEXT NOT NULL, source TEXT NOT NULL, origin TEXT NOT NULL,
+    learnt TEXT NOT NULL, UNIQUE (source, origin, system, compass, device_id, vehicle)
+)
+"""
 _STEPS = {
-    0: (_WRITES, _ESTIMATES),
+    0: (_WRITES, _ESTIMATES, _LEARNT),
     # Format 1 knew a vehicle by its system id alone, and did not look again after a reboot.
     1: (
         "ALTER TABLE writes ADD COLUMN boot_ms INTEGER",
@@ -32,7 +40,10 @@ _STEPS = {
         "INSERT INTO estimates SELECT system, device_id, unix_ns, vehicle, change, verdict, offsets_mg, sigma_mg "
         "FROM estimates_1",
         "DROP TABLE estimates_1",
+        _LEARNT,
     ),
+    # Format 2 kept the latest estimate of a compass and not what each flight had taught.
+    2: (_LEARNT,),
 }
 """What brings a file from each format to the present one."""
 

@@ -8,25 +8,33 @@ from pathlib import Path
 from typing import Any
 
 from magmav.commands.common import progress_bar, settings_of, show
-from magmav.settings import SettingsError
 
 
 def fit(o: argparse.Namespace) -> int:
     """One log or many."""
+    from magmav.commands.fit_many import remember, run_many, wanted
     from magmav.fitting import FitOptions
     from magmav.fitting import fit as run
     from magmav.view.fit import fit_view
 
     settings = settings_of(o)
     options = FitOptions(o.soft_iron, o.motor, o.scale, None if o.reference is None else str(o.reference))
-    if o.params is not None and len(o.logs) != 1:
-        raise SettingsError("--params: one file is for one log; give --out DIR for several")
+    if wanted(o):
+        return run_many(o, settings, options)
+    if o.report is not None:
+        from magmav.view.report import check_report_name, write_report
+
+        check_report_name(o.report)  # before minutes of work, not after
     entries: list[dict[str, Any]] = []
     for path in o.logs:
         with ExitStack() as stack:
             entries.append(run(path, settings, options=options, progress=progress_bar(stack, path.name)))
     if o.params is not None:
         write_parameters(entries[0], o.params)
+    if o.report is not None:
+        write_report(entries[0], o.report)
+    if o.store is not None:
+        remember(o.store, entries)
     show(o, {"logs": entries}, fit_view)
     return 0
 

@@ -11,6 +11,8 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
+from rich.console import Group
+
 from magmav.commands.common import Refused, Result, settings_of, show, signer_of, stderr_console
 from magmav.core.types import Change, Reading, Reason, Record
 from magmav.geomag import world_magnetic_model
@@ -174,15 +176,18 @@ def _ended(o: argparse.Namespace, result: Result, good: tuple[str, ...]) -> int:
 
 
 def history(o: argparse.Namespace) -> int:
-    """Every write on record."""
+    """Every write on record, and what every flight taught."""
+    from magmav.learnt import shadows
     from magmav.live import history_entry
     from magmav.store import Store, default_path
+    from magmav.view.learnt import learnt_view
     from magmav.view.table import history_view
 
     if o.limit < 1:
         raise SettingsError(f"--limit: want 1 or more, got {o.limit}")
     path = o.store or default_path()
     rows: list[Result] = []
+    learnt: list[Result] = []
     if path.exists():
         with Store(path) as store:
             if o.dismiss is not None:
@@ -190,5 +195,7 @@ def history(o: argparse.Namespace) -> int:
                     raise Refused(f"{path}: no write {o.dismiss} waits to be undone")
                 store.dismiss(o.dismiss)
             rows = [history_entry(row) for row in store.history(o.limit)]
-    show(o, {"store": str(path), "writes": rows}, lambda result: history_view(result["writes"]))
+            learnt = shadows(store.learnt())[: o.limit]
+    result = {"store": str(path), "writes": rows, "learnt": learnt}
+    show(o, result, lambda result: Group(history_view(result["writes"]), learnt_view(result["learnt"])))
     return 0

@@ -14,6 +14,7 @@ from typing import Any
 from magmav import __version__
 from magmav.core.types import FieldModel
 from magmav.fitting.answer import Told, answer
+from magmav.fitting.dated import Dated
 from magmav.fitting.tape import Recorder
 from magmav.geomag import world_magnetic_model
 from magmav.logs import HEAD, Progress, kind_of
@@ -57,7 +58,7 @@ def fit(
     wrong = [c for c in options.compasses if c not in (1, 2, 3)]
     if wrong:
         raise ValueError(f"compasses: want 1, 2 or 3, got {wrong[0]}")
-    recorder = Recorder()
+    recorder, dated = Recorder(), Dated()
     references: dict[int, Reference] = {}
     boots: dict[int, Vehicle | Boot] = {}
     recording = open_recording(path, progress)
@@ -68,7 +69,7 @@ def fit(
             model,
             source=str(path),
             reference_csv=None if options.heading_reference is None else Path(options.heading_reference),
-            watchers=(recorder.watch,),
+            watchers=(recorder.watch, dated),
             references=references,
             tap=recorder.tap,
             boots=boots,
@@ -87,7 +88,7 @@ def fit(
             if tape is None or (options.compasses and entry["compass"] not in options.compasses):
                 continue
             answer(entry, tape, told, options)
-    result["file"] = file_facts(path)
+    result["file"] = file_facts(path) | {"began_unix_s": dated.unix_s(recording.unix_offset_ns)}
     result["made_by"] = {"magmav": __version__, "at": None}
     return result
 
