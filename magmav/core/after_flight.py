@@ -55,6 +55,7 @@ class AfterFlight:
     boot_ns: NDArray[np.int64]
     estimates: tuple[Estimate, ...]
     changes_ns: tuple[int, ...]
+    foretold: Estimate | None = None  # what was believed at the time asked for, with nothing of what came after
 
     @property
     def answer(self) -> Estimate:
@@ -81,15 +82,20 @@ class AfterFlight:
         return self.iron_b_mg(np.array([s.boot_ns - round(1e9 * s.age_s) for s in samples], dtype=np.int64))
 
 
-def after_flight(samples: Sequence[Sample], tuning: Tuning | None = None) -> AfterFlight | None:
+def after_flight(
+    samples: Sequence[Sample], tuning: Tuning | None = None, until_ns: int | None = None
+) -> AfterFlight | None:
     """The iron along one stretch of one compass; None where nothing is known of it.
 
     samples : as the estimator was given them, in order of time; of one boot, undone with one set of stored values.
+    until_ns : boot time of ``foretold``.
     """
     flown = _framed(_flown(samples))
     if not flown:
         return None
     run = _BothWays(flown, tuning)
+    then = max((t for t in run.before if until_ns is not None and t <= until_ns), default=None)
+    foretold = None if then is None else run.forward.says(run.before[then])
     changes = run.changes()
     if changes or run.startled:
         run = _BothWays(flown, tuning, changes, run.middle_ns)
@@ -97,7 +103,7 @@ def after_flight(samples: Sequence[Sample], tuning: Tuning | None = None) -> Aft
     if not known:
         return None
     times = np.array([t for t, _ in known], dtype=np.int64)
-    return AfterFlight(times, tuple(e for _, e in known), tuple(sorted(t for t in changes if t > times[0])))
+    return AfterFlight(times, tuple(e for _, e in known), tuple(sorted(t for t in changes if t > times[0])), foretold)
 
 
 # ---------------------------------------------------------------- samples, and time turned round

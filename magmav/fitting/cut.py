@@ -30,12 +30,14 @@ _LEAST_LEFT_S = 20.0  # of flight beside what is cut
 
 TEXTS = {
     "GROUND": "on the ground: steel and concrete teach nothing about a compass",
+    "LOW": "within 5 m of the ground, or not known to be higher",
+    "HANDS": "turned by hand before the flight: the flight teaches better",
     "CRASHED": "after the crash",
     "TUMBLE": "tumbling before the crash: tilted beyond 60 degrees",
     "SATURATED": "sensor at the end of its range",
     "TAKEOFF_ANOMALY": "field differs from the rest of the flight after take-off: steel below the place",
     "LANDING_ANOMALY": "field differs from the rest of the flight before landing: steel below the place",
-    "SETTLING": "just after a change of parameters, or no trustworthy motion",
+    "SETTLING": "just after a change of compass parameters",
 }
 
 
@@ -57,10 +59,13 @@ class Span:
         return {"from_s": round(self.from_s, 3), "to_s": round(self.to_s, 3), "code": self.code, "text": self.text}
 
 
-def before_the_fit(c: Columns, phase: Phase) -> tuple[Flags, list[Span]]:
-    """What may teach, (N,), and the spans that may not."""
+def before_the_fit(c: Columns, phase: Phase, by_hand: Flags, settling: Flags) -> tuple[Flags, list[Span]]:
+    """What may teach, (N,), and the spans that may not.
+
+    by_hand : turned by hand before a flight.  settling : just after a compass parameter changed.
+    """
     labels = np.full(len(c.boot_s), "", dtype=object)
-    labels[~c.learn] = "SETTLING"
+    labels[~c.learn] = "LOW" if phase.flyer else "SETTLING"
     flown = [f for f in phase.flights if f.takeoff_ns is not None]
     if phase.flyer and flown:
         aloft = np.zeros(len(c.boot_s), dtype=bool)
@@ -71,6 +76,8 @@ def before_the_fit(c: Columns, phase: Phase) -> tuple[Flags, list[Span]]:
         labels[~c.learn & ~aloft] = "GROUND"
     elif phase.flyer:
         labels[~c.learn] = "GROUND"
+    labels[~c.learn & settling] = "SETTLING"
+    labels[by_hand] = "HANDS"
     crashes = [f.crash_ns / 1e9 for f in phase.flights if f.crash_ns is not None]
     if phase.crash_ns is not None:
         crashes.append(phase.crash_ns / 1e9)

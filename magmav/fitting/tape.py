@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,9 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from magmav.comparison import Columns, Tape
+from magmav.comparison import Tape
 from magmav.core.channel import Circumstances
-from magmav.core.types import CurrentReading, Reading, Record, Sample
+from magmav.core.types import CurrentReading, ParamReading, Reading, Record, Sample
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +42,8 @@ class Recorder:
         self._currents: dict[tuple[int, int], Currents] = {}
         self._latest_s: dict[int, float] = {}
         self._boot: dict[int, int] = {}
+        self._parameters: dict[int, dict[str, float]] = {}
+        self._moved_s: dict[int, list[float]] = {}
 
     def tap(self, sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
         """Take one sample."""
@@ -53,6 +56,21 @@ class Recorder:
             series = self._currents.setdefault((reading.system, self._boot[reading.system]), Currents())
             series.boot_s.append(self._latest_s[reading.system])
             series.ampere.append(reading.ampere)
+        elif isinstance(reading, ParamReading):
+            held = self._parameters.setdefault(reading.system, {})
+            if held.get(reading.name, reading.value) != reading.value and "MAG" in reading.name.replace(
+                "COMPASS", "MAG"
+            ):
+                self._moved_s.setdefault(reading.system, []).append(self._latest_s.get(reading.system, -math.inf))
+            held[reading.name] = reading.value
+
+    def parameters(self, system: int) -> dict[str, float]:
+        """Every parameter as last heard."""
+        return dict(self._parameters.get(system, {}))
+
+    def moved_s(self, system: int) -> tuple[float, ...]:
+        """Boot times at which a compass parameter came to another value."""
+        return tuple(self._moved_s.get(system, ()))
 
     def currents(self, system: int) -> Currents | None:
         """Of the boot with most of them; None where nobody said."""
@@ -65,6 +83,9 @@ class Recorder:
             tape.close()
 
 
-def columns_of(tape: Tape) -> Columns:
-    """The tape as arrays."""
-    return Columns.of(tape.heard)
+def settled_after(boot_s: Floats, moved_s: Sequence[float], settle_s: float) -> NDArray[np.bool_]:
+    """(N,): within so many seconds of one of these moments."""
+    out = np.zeros(len(boot_s), dtype=bool)
+    for t in moved_s:
+        out |= (boot_s >= t) & (boot_s <= t + 3.0 * settle_s)
+    return out
