@@ -142,8 +142,9 @@ def _row(vehicle: Json, compass: Json, anchor: str) -> Sequence[Child]:
 def _flights(vehicle: Json) -> Markup:
     told = []
     for flight in vehicle.get("flights") or []:
-        part = f"{number(flight.get('takeoff_s'), '.0f')} to {number(flight.get('landed_s'), '.0f')} s"
-        crash = flight.get("crash_s")
+        start, end, crash = (flight.get(f"{k}_s") for k in ("takeoff", "landed", "crash"))
+        part = "no take-off seen" if start is None else f"from {number(start, '.0f')} s"
+        part += ", no landing seen" if end is None else f" to {number(end, '.0f')} s"
         told.append(part + (f", crash at {number(crash, '.0f')} s" if crash is not None else ""))
     reboots = vehicle.get("reboots")
     pairs: list[tuple[str, Child]] = [

@@ -78,7 +78,8 @@ def _largest(values: Sequence[float]) -> str:
 
 def coverage(seen: Json) -> Markup | None:
     """Which directions of the field, in body axes, were seen: two discs, forward up, right on the right."""
-    rows = [r for r in seen.get("directions") or () if r.get("n") is not None]
+    told = seen.get("directions") or ()
+    rows = [r for r in told if None not in (r.get("n"), r.get("azimuth_deg"), r.get("elevation_deg"))]
     if not rows:
         return None
     most = max((r["n"] for r in rows), default=0)
@@ -164,8 +165,11 @@ def _power(series: Json, times: Sequence[Number]) -> tuple[list[Number], str, st
     return [], "", ""
 
 
-def offsets(series: Json, cut: Sequence[Json], new: Sequence[Number] | None) -> Markup | None:
-    """Three narrow plots, one an axis, each with a scale of its own: value and one sigma."""
+def offsets(series: Json, cut: Sequence[Json], iron_mg: Sequence[Number] | None) -> Markup | None:
+    """Three narrow plots, one an axis, each with a scale of its own: value and one sigma.
+
+    iron_mg : the fit's hard iron, whose negative is drawn across.
+    """
     times = series.get("offsets_t_s") or []
     values, sigmas = series.get("offsets_mg") or [], series.get("offsets_sigma_mg") or []
     if not times or len(values) != len(times):
@@ -182,8 +186,9 @@ def offsets(series: Json, cut: Sequence[Json], new: Sequence[Number] | None) -> 
         across, x_name, _ = _time_axis(panel)
         panel.axes(across if i == 2 else [], [(v, label(v)) for v in ticks(*panel.y, 3)], x_name if i == 2 else "")
         _shade(panel, cut)
-        if _at(new or (), i) is not None:
-            y = panel.at_y(float(_at(new or (), i) or 0.0))
+        iron = _at(iron_mg or (), i)
+        if iron is not None:
+            y = panel.at_y(-iron)
             panel.inside.append(rule(0.0, y, panel.right, y, INK, 1.0, "2 3"))
         edges = [(None, None) if v is None or s is None else (v - s, v + s) for v, s in zip(value, sigma, strict=True)]
         panel.band(times, [e[0] for e in edges], [e[1] for e in edges], AXIS_COLOURS[i], 0.3)
@@ -196,10 +201,11 @@ def offsets(series: Json, cut: Sequence[Json], new: Sequence[Number] | None) -> 
     said = "Offsets of each moment: " + ", ".join(told) + "."
     keys = [
         swatch(_banded, "offset of the moment, one sigma"),
-        line_key("the offset to store", INK, "2 3", 1.6),
+        line_key("the fit's answer", INK, "2 3", 1.6),
         *_cut_key(cut),
     ]
-    caption = f"{said} From the smoother, which looks back from the end as well."
+    caption = f"{said} Run both ways, so that each moment knows what came later too. "
+    caption += "Without soft iron and power: the values to store are in the table of offsets."
     return picture("Offsets over time", said, 302, panels, keys, caption)
 
 
@@ -278,7 +284,7 @@ def _time_axis(panel: Panel) -> tuple[list[tuple[float, str]], str, str]:
 
 def _shade(panel: Panel, cut: Sequence[Json]) -> None:
     for part in cut:
-        if part.get("from_s") is not None and part.get("to_s") is not None:
+        if None not in (part.get("from_s"), part.get("to_s")):
             panel.span(part["from_s"], part["to_s"])
 
 

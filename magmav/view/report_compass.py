@@ -57,10 +57,11 @@ def _of_fit(fit: Json) -> list[Child]:
     heading = fit.get("heading") or {}
     pictures = [
         charts.deviation(fit.get("deviation") or []),
+        tag("div", _card(fit.get("deviation") or [])),
         charts.coverage(fit.get("coverage") or {}),
         charts.field(series, cut),
         charts.heading(series, cut, heading.get("reference")),
-        charts.offsets(series, cut, fit.get("new_offsets_mg")),
+        charts.offsets(series, cut, fit.get("hard_iron_mg")),
     ]
     return [
         tag(
@@ -72,9 +73,8 @@ def _of_fit(fit: Json) -> list[Child]:
             class_="pair",
         ),
         tag("div", pictures, class_="pictures"),
-        _card(fit.get("deviation") or []),
-        _spans(fit),
-        _beyond(fit),
+        tag("div", _spans(fit), class_="whole"),
+        tag("div", _beyond(fit), class_="whole"),
     ]
 
 
@@ -82,7 +82,7 @@ def _values(fit: Json) -> list[Child]:
     rows: list[Sequence[Child]] = [
         (name, *(number(_item(fit.get(key), i), form) for i in range(3))) for name, key, form in _ROWS
     ]
-    axes = [str(_item(fit.get("axes"), i)) for i in range(3)]
+    axes = [word(_item(fit.get("axes"), i)) for i in range(3)]
     rows.append(("how it is known", *(tag("span", AXES.get(axis, axis)) for axis in axes)))
     note = (
         "Body axes, mG, as ArduPilot would add them. Hard iron is what the sensor itself carries, with no current "
@@ -110,11 +110,14 @@ def _parameters(named: Json) -> list[Child]:
     title = tag("h3", f"Parameters of the autopilot ({kind})")
     if not names:
         return [title, tag("p", "No parameter is to be changed, or which ones belong to this compass is not known.")]
-    rows = [
-        (n, exact(old.get(n)), exact(changed.get(n, new.get(n))), tag("span", "write" if n in changed else "stays"))
-        for n in names
-    ]
+    rows = [(n, exact(old.get(n)), exact(new.get(n)), tag("span", _write(n, new.get(n), changed))) for n in names]
     return [title, table(("parameter", "stored", "new", ""), rows, changed=[n in changed for n in names])]
+
+
+def _write(name: str, new: Any, changed: Json) -> str:
+    if name not in changed:
+        return "stays"
+    return "write" if changed[name] == new else f"write {exact(changed[name])}"
 
 
 def _misfit(fit: Json) -> list[Child]:
@@ -155,8 +158,11 @@ def _card(card: Sequence[Json]) -> list[Child]:
         told = number(after, "+.2f") if sigma is None else f"{number(after, '+.2f')} \u00b1 {number(sigma, '.2f')}"
         heading = f"{charts.POINTS[i % 8]} {number(row.get('heading_deg'), '.0f')}"
         rows.append((heading, number(row.get("before_deg"), "+.2f"), told))
-    note = "A level vehicle, shown less true heading, degrees; after has one sigma. Magnetic headings."
-    return [table(("heading", "as stored", "new offsets"), rows, "Deviation card"), tag("p", note, class_="quiet")]
+    note = "Level vehicle: heading shown less the heading it is on, degrees, with one sigma of the new."
+    return [
+        table(("heading", "as stored", "new offsets"), rows, "Deviation card, figures"),
+        tag("p", note, class_="quiet"),
+    ]
 
 
 def _spans(fit: Json) -> list[Child]:

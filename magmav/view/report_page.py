@@ -42,13 +42,14 @@ table{border-collapse:collapse;margin:.4rem 0;font-size:.94rem;font-variant-nume
 caption{text-align:left;font-weight:600;padding:.2rem 0}
 th,td{padding:.22rem .8rem .22rem 0;text-align:right;vertical-align:top;border-bottom:1px solid #d0d0d0}
 th:first-child,td:first-child,td.word,th.word{text-align:left}
+th:last-child,td:last-child{padding-right:.1rem}
 thead th{border-bottom:2px solid #767676;vertical-align:bottom;white-space:normal}
 tbody th{font-weight:400}
 tr.changed td,tr.changed th{font-weight:650}
 td.word{white-space:normal;overflow-wrap:anywhere}
 .pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(23rem,100%),1fr));gap:0 1.6rem}
 .pair>div{min-width:0}
-.pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(21rem,100%),1fr));gap:1rem 1.6rem}
+.pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(24rem,100%),1fr));gap:1rem 1.6rem}
 figure{margin:.6rem 0 0;min-width:0}
 figcaption{font-size:.9rem;color:#4a4a4a}
 figure h3{margin:.2rem 0}
@@ -62,11 +63,11 @@ details{margin:.8rem 0}
 summary{cursor:pointer;padding:.3rem 0}
 pre{font-size:.78rem;white-space:pre-wrap;overflow-wrap:anywhere;background:#f6f6f6;padding:.6rem;max-height:60vh;
  overflow:auto}
-@media (max-width:30rem){body{padding:.75rem}th,td{padding-right:.55rem;font-size:.88rem}h1{font-size:1.3rem}
+@media (max-width:30rem){body{padding:.75rem}th,td{padding-right:.5rem;font-size:.86rem}h1{font-size:1.3rem}
  .facts{grid-template-columns:1fr}.facts dd{margin-bottom:.3rem}}
 @media print{@page{size:A4;margin:14mm}body{max-width:none;padding:0;font-size:10.5pt}
  .pictures{grid-template-columns:1fr 1fr;gap:.6rem 1.2rem}
- figure,table,.verdict,tr{break-inside:avoid}h2,h3,caption{break-after:avoid}
+ figure,table,.verdict,.whole,tr{break-inside:avoid}h2,h3,caption{break-after:avoid}
  section.compass{break-before:page}section.compass.first{break-before:auto}
  .wide{overflow:visible}a{color:inherit;text-decoration:none}.screen{display:none}
  *{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
@@ -87,7 +88,9 @@ def text(value: object) -> Markup:
     """Escaped text; characters that show nothing, or turn the line round, become U+FFFD."""
     if isinstance(value, Markup):
         return value
-    shown = "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in str(value))
+    shown = str(value)
+    if not shown.isprintable():
+        shown = "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in shown)
     return Markup(escape(shown, quote=True))
 
 
@@ -124,14 +127,15 @@ def table(
 ) -> Markup:
     """A table that scrolls by itself where a phone is narrower. The first cell of a row names it.
 
-    changed : rows to set in bold, in order. Cells that are no figures stand on the left.
+    changed : rows to set in bold, in order. Cells that are no figures stand on the left, and so do heads that are
+    Markup.
     """
     body = []
     for i, row in enumerate(rows):
         cells = [tag("th", row[0], scope="row")]
         cells += [tag("td", cell, class_=None if _is_figure(cell) else "word") for cell in row[1:]]
         body.append(tag("tr", cells, class_="changed" if i < len(changed) and changed[i] else None))
-    heads = [tag("th", cell, scope="col") for cell in head]
+    heads = [tag("th", cell, scope="col", class_="word" if isinstance(cell, Markup) else None) for cell in head]
     top = None if caption is None else tag("caption", caption)
     whole = tag("table", top, tag("thead", tag("tr", heads)), tag("tbody", body))
     return tag("div", whole, class_="wide")
@@ -182,8 +186,9 @@ def exact(value: Any) -> str:
     """A parameter's value with as many digits as a 32-bit float has, as the parameter file writes it."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return word(value)
-    short = str(np.float32(value))
-    return word(value) if not math.isfinite(value) or float(short) != value else short.removesuffix(".0")
+    if not math.isfinite(value) or float(np.float32(value)) != value:
+        return word(value)
+    return str(np.float32(value)).removesuffix(".0")
 
 
 def page(title: str, body: Iterable[Child]) -> str:

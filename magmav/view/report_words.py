@@ -66,18 +66,29 @@ def heading_sentence(fit: Json) -> str:
         return f"How far the heading is off {against} is not known."
     if before is None:
         return f"Heading error {against}: {number(after, '.1f', 'deg')} RMS {where}".rstrip() + "."
-    verb = "falls" if after < before else "does not fall: it goes"
+    verb = "falls" if _falls(fit) else "does not fall: it goes"
     change = f"from {number(before, '.1f')} to {number(after, '.1f')} degrees RMS"
     return f"Heading error {against} {verb} {change} {where}".rstrip() + "."
+
+
+def _falls(fit: Json) -> bool:
+    """True where the heading gets better, or that is not known."""
+    heading = fit.get("heading") or {}
+    held = heading.get("held_out") or {}
+    part = held if held.get("after") else heading
+    before, after = ((part.get(k) or {}).get("rms_deg") for k in ("before", "after"))
+    return before is None or after is None or after < before
 
 
 def to_do(compass: Json) -> list[str]:
     """Advice of the fit, else what the state asks for."""
     fit = compass.get("fit")
     state = str((fit or compass).get("state"))
-    advice = [str(line) for line in (fit or {}).get("advice") or ()]
+    advice = [str(line) for line in (fit or {}).get("advice") or () if line]
     if advice:
         return advice
+    if state == "READY" and fit is not None and not _falls(fit):
+        return ["What is stored does as well on the part that was held out: there is no need to change it."]
     if fit is None and state == "READY":
         return [_DO["LEARNING"]]
     if state == "READY" and not (fit or {}).get("parameters", {}).get("changed"):
@@ -96,7 +107,7 @@ def autopilot_name(vehicle: Json) -> str:
 def lines(items: Any) -> list[Markup]:
     """Reasons or causes; the code, by which the docs explain them, and the figures in small letters."""
     out = []
-    for item in items or ():
+    for item in filter(None, items or ()):
         figure = item.get("figure")
         more = f": {word(figure)}" if figure else ""
         code = tag("span", f"({word(item.get('code'))}{more})", class_="quiet")
