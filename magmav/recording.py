@@ -21,6 +21,7 @@ from magmav.pipeline import Pipeline
 from magmav.reference import Reference
 from magmav.service import Watcher, all_counts, hand_on
 from magmav.settings import Settings
+from magmav.tlog_recording import MOST_BYTES, TlogRecording
 from magmav.vehicle import Boot, Tap, Vehicle
 
 Result = dict[str, Any]
@@ -41,6 +42,8 @@ def open_recording(path: str | Path, progress: Progress | None = None) -> Record
         from magmav.logs.dataflash_readings import DataflashRecording
 
         return DataflashRecording(path, progress)
+    if path.is_file() and 0 < path.stat().st_size <= MOST_BYTES:
+        return TlogRecording(path, progress)
     return LinkRecording(TlogLink(path, progress))
 
 
@@ -199,4 +202,6 @@ def play(
 
 
 def _storeys(recording: Recording) -> dict[str, dict[str, int]]:
-    return recording.by_storey() if isinstance(recording, LinkRecording) else {"log": dict(recording.counts)}
+    if isinstance(recording, LinkRecording | TlogRecording):
+        return recording.by_storey()
+    return {"log": dict(recording.counts)}

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import ardupilotmega as dialect
-from tlog_parity import one_by_one, values_of, woven
+from tlog_parity import HARM, Harm, cut, flight, flip, one_by_one, values_of, woven
 
 from magmav.link import LinkError
 from magmav.logs.tlog import columns, read_tlog
@@ -22,42 +19,6 @@ from magmav.mavlink.decode import Decoder
 
 WANTED = Decoder().wanted
 DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared" / "data"))
-START_US = 1_700_000_000_000_000
-
-
-def messages(rng: random.Random) -> list[Any]:
-    """One of each kind that is read, and two that are not, with numbers that trim to any length."""
-    small = [rng.choice((0, 0, 1, 255, -1)) for _ in range(9)]
-    angles = [rng.choice((0.0, 0.5, -3.1, float("nan"))) for _ in range(6)]
-    return [
-        dialect.MAVLink_heartbeat_message(2, 3, 128, rng.choice((0, 4)), 0, 3),
-        dialect.MAVLink_raw_imu_message(rng.randrange(2**40), *small),
-        dialect.MAVLink_scaled_imu2_message(rng.randrange(2**31), *small),
-        dialect.MAVLink_attitude_message(rng.randrange(2**31), *angles),
-        dialect.MAVLink_param_value_message(b"COMPASS_OFS_X", rng.choice(angles), 9, 900, rng.randrange(900)),
-        dialect.MAVLink_battery_status_message(0, 0, 0, 0, [rng.randrange(5)] * 10, rng.randrange(900), 0, 0, -1),
-        dialect.MAVLink_global_position_int_message(1, 2, 3, 4, 5, 6, 7, 8, 0),
-        dialect.MAVLink_mag_cal_report_message(0, 0, 4, 1, 1.0, *angles, *angles[:3]),
-        dialect.MAVLink_statustext_message(6, b"a text with \xfd and \xfe in it"),
-        dialect.MAVLink_rc_channels_message(1, 8, *([1500] * 18), 100),
-    ]
-
-
-def flight(seed: int, count: int = 120) -> list[bytes]:
-    """Records of both versions, signed and plain, of three systems, two of them with a second component."""
-    rng = random.Random(seed)
-    out = []
-    stamp_us = START_US
-    for _ in range(count):
-        mav = dialect.MAVLink(None, srcSystem=rng.choice((1, 1, 2, 255)), srcComponent=rng.choice((1, 1, 100)))
-        mav.seq = rng.randrange(256)
-        signed = rng.random() < 0.2
-        if signed:
-            mav.signing.secret_key, mav.signing.sign_outgoing = bytes(32), True
-        frame = rng.choice(messages(rng)).pack(mav, force_mavlink1=not signed and rng.random() < 0.3)
-        stamp_us += rng.choice((0, 1000, 20_000, 20_000, 20_000, -300, 2_500_000))
-        out.append(stamp_us.to_bytes(8, "big") + bytes(frame))
-    return out
 
 
 def same(path: Path, data: bytes) -> None:
@@ -107,45 +68,9 @@ def test_fields_are_those_of_the_dialect_number_for_number() -> None:
     assert seen == sum(got.heard.values()) > 250
 
 
-def flip(data: bytearray, rng: random.Random) -> None:
-    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-
-
-def cut(data: bytearray, rng: random.Random) -> None:
-    del data[rng.randrange(len(data)) :]
-
-
-def lose(data: bytearray, rng: random.Random) -> None:
-    at = rng.randrange(len(data))
-    del data[at : at + rng.randrange(1, 200)]
-
-
-def stuff(data: bytearray, rng: random.Random) -> None:
-    at = rng.randrange(len(data))
-    data[at:at] = rng.choice((rng.randbytes(rng.randrange(1, 400)), b"\xfd" * 30, b"\0\x05" * 40, bytes(90)))
-
-
-def lie(data: bytearray, rng: random.Random) -> None:
-    """A length or a flag that is not true."""
-    at = data.find(b"\xfd", rng.randrange(len(data)))
-    if at >= 0 and at + 2 < len(data):
-        data[at + rng.choice((1, 2))] = rng.randrange(256)
-
-
-def repeat(data: bytearray, rng: random.Random) -> None:
-    """Some of it comes twice: times go back, and frames stand within frames."""
-    at = rng.randrange(len(data))
-    data[at:at] = data[rng.randrange(len(data)) :][: rng.randrange(1, 900)]
-
-
-HARM: list[Callable[[bytearray, random.Random], None]] = [flip, cut, lose, stuff, lie, repeat]
-
-
 @given(seed=st.integers(0, 2**32 - 1), harm=st.lists(st.sampled_from(HARM), min_size=1, max_size=6))
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_same_as_one_by_one_however_damaged(
-    tmp_path: Path, seed: int, harm: list[Callable[[bytearray, random.Random], None]]
-) -> None:
+def test_same_as_one_by_one_however_damaged(tmp_path: Path, seed: int, harm: list[Harm]) -> None:
     data, rng = bytearray(b"".join(flight(seed % 50, 60))), random.Random(seed)
     for one in harm:
         if len(data) > 1:

@@ -32,17 +32,17 @@ from magmav.core.types import (
 from magmav.mavlink.codec import Message
 from magmav.mavlink.values import bytewise, cast
 
-_G = 9.80665
-_MS, _US = 1_000_000, 1_000
+G = 9.80665
+MS, US = 1_000_000, 1_000
 _PX4, _NO_AUTOPILOT = 12, 8  # MAV_AUTOPILOT_PX4, MAV_AUTOPILOT_INVALID
 _SAYS_BYTEWISE, _SAYS_CAST = 16, 131072  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE and _C_CAST
 _ONLY_PX4 = ("CAL_", "SENS_")  # names that tell whose they are before a heartbeat does
-_EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
+EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
 # No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
-_MOST_RADS, _MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
+MOST_RADS, MOST_RAD, _MOST_MSS, _MOST_MG = 100.0, 6.3, 1e4, 1e5
 _MOST_GAUSS = 10.0  # a length beyond it, twenty times the Earth's field, is in another unit
-_END_OF_SCALE = 32767  # of 16 bits: 33 gauss, or another unit
-_COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
+END_OF_SCALE = 32767  # of 16 bits: 33 gauss, or another unit
+COMPASS_OF = {"RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2, "SCALED_IMU3": 3}
 
 
 class Decoder:
@@ -90,9 +90,8 @@ class Decoder:
         how = self._how.get(kind)
         if how is None:
             return []
-        system, component = message.get_srcSystem(), message.get_srcComponent()
-        if kind != "HEARTBEAT" and self._autopilot.get(system, component) != component:
-            self.counts["not from the autopilot"] += 1
+        system = message.get_srcSystem()
+        if kind != "HEARTBEAT" and not self.believes(system, message.get_srcComponent()):
             return []
         try:
             return how(message, system)
@@ -103,36 +102,48 @@ class Decoder:
             self.counts[f"{kind}: not a number"] += 1
             return []
 
+    def believes(self, system: int, component: int) -> bool:
+        """Whether this component speaks for its vehicle, as far as its heartbeats told; counted where it does not."""
+        if self._autopilot.get(system, component) == component:
+            return True
+        self.counts["not from the autopilot"] += 1
+        return False
+
+    def source_of(self, kind: str, system: int) -> str:
+        """What a compass in RAW_IMU or SCALED_IMU is called.
+
+        The same message, but PX4 sends the sensor's own field in the sensor's own axes (autopilots.md 4.1).
+        """
+        return f"{kind} raw" if self._kind.get(system) == _PX4 else kind
+
     def _imu(self, m: Message, system: int) -> list[Reading]:
         kind = m.get_type()
         if kind == "RAW_IMU":
-            if m.time_usec > _EPOCH_US:
+            if m.time_usec > EPOCH_US:
                 self.counts["RAW_IMU: time is not since boot"] += 1
                 return []
-            boot_ns = m.time_usec * _US
+            boot_ns = m.time_usec * US
         else:
-            boot_ns = m.time_boot_ms * _MS
+            boot_ns = m.time_boot_ms * MS
         out: list[Reading] = []
         if (m.xacc, m.yacc, m.zacc) != (0, 0, 0):
-            force = vec3((m.xacc * _G / 1e3, m.yacc * _G / 1e3, m.zacc * _G / 1e3), "acceleration")
+            force = vec3((m.xacc * G / 1e3, m.yacc * G / 1e3, m.zacc * G / 1e3), "acceleration")
             rate = vec3((m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3), "rate")
             out.append(InertialReading(system, kind, boot_ns, force, rate))
         if (m.xmag, m.ymag, m.zmag) == (0, 0, 0):
             self.counts[f"{kind}: no compass (all zero)"] += 1
-        elif max(abs(m.xmag), abs(m.ymag), abs(m.zmag)) >= _END_OF_SCALE:
+        elif max(abs(m.xmag), abs(m.ymag), abs(m.zmag)) >= END_OF_SCALE:
             self.counts[f"{kind}: field at the end of its scale"] += 1
         else:
             field = vec3((m.xmag, m.ymag, m.zmag), "field")
-            # The same message, but PX4 sends the sensor's own field in the sensor's own axes (autopilots.md 4.1).
-            source = f"{kind} raw" if self._kind.get(system) == _PX4 else kind
-            out.append(MagReading(system, _COMPASS_OF[kind], source, boot_ns, field))
+            out.append(MagReading(system, COMPASS_OF[kind], self.source_of(kind, system), boot_ns, field))
         return out
 
     def _highres(self, m: Message, system: int) -> list[Reading]:
-        if m.time_usec > _EPOCH_US or m.id > 2:
+        if m.time_usec > EPOCH_US or m.id > 2:
             self.counts["HIGHRES_IMU: time is not since boot, or instance over 3"] += 1
             return []
-        boot_ns = m.time_usec * _US
+        boot_ns = m.time_usec * US
         out: list[Reading] = []
         if m.fields_updated & 0b111111 == 0b111111:
             force, rate = (
@@ -153,18 +164,18 @@ class Decoder:
         return out
 
     def _attitude(self, m: Message, system: int) -> list[Reading]:
-        rate = _within(_MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        rate = _within(MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
         roll, pitch, yaw = angles = m.roll, m.pitch, m.yaw
-        _bounded(_MOST_RAD, angles, "attitude")
-        return [AttitudeReading(system, "ATTITUDE", m.time_boot_ms * _MS, roll, pitch, yaw, rate)]
+        _bounded(MOST_RAD, angles, "attitude")
+        return [AttitudeReading(system, "ATTITUDE", m.time_boot_ms * MS, roll, pitch, yaw, rate)]
 
     def _quaternion(self, m: Message, system: int) -> list[Reading]:
-        rate = _within(_MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
+        rate = _within(MOST_RADS, (m.rollspeed, m.pitchspeed, m.yawspeed), "rate")
         angles = euler_from_quaternion(m.q1, m.q2, m.q3, m.q4)
         if angles is None:
             self.counts["ATTITUDE_QUATERNION: not a rotation"] += 1
             return []
-        return [AttitudeReading(system, "ATTITUDE_QUATERNION", m.time_boot_ms * _MS, *angles, rate)]
+        return [AttitudeReading(system, "ATTITUDE_QUATERNION", m.time_boot_ms * MS, *angles, rate)]
 
     def _place(self, m: Message, system: int, boot_ns: int) -> list[Reading]:
         lat, lon = m.lat / 1e7, m.lon / 1e7
@@ -174,12 +185,12 @@ class Decoder:
         return [PositionReading(system, m.get_type(), boot_ns, lat, lon, m.alt / 1e3)]
 
     def _global_position(self, m: Message, system: int) -> list[Reading]:
-        boot_ns = m.time_boot_ms * _MS
+        boot_ns = m.time_boot_ms * MS
         motion = MotionReading(system, boot_ns, m.vx / 100.0, m.vy / 100.0, m.relative_alt / 1e3)
         return [*self._place(m, system, boot_ns), motion]
 
     def _gps(self, m: Message, system: int) -> list[Reading]:
-        return self._place(m, system, m.time_usec * _US) if m.fix_type >= 3 else []
+        return self._place(m, system, m.time_usec * US) if m.fix_type >= 3 else []
 
     def _battery(self, m: Message, system: int) -> list[Reading]:
         # BATTERY_STATUS 0 and SYS_STATUS speak of the same, first battery, in units of 10 mA.
@@ -194,7 +205,7 @@ class Decoder:
         # Before 2010 no field model and no GPS week is meant: the vehicle does not know the date yet.
         if m.time_unix_usec < 1_262_304_000_000_000 or m.time_unix_usec > 4_000_000_000_000_000:
             return []
-        return [TimeReading(system, m.time_boot_ms * _MS, m.time_unix_usec * _US)]
+        return [TimeReading(system, m.time_boot_ms * MS, m.time_unix_usec * US)]
 
     def _heartbeat(self, m: Message, system: int) -> list[Reading]:
         component = m.get_srcComponent()
