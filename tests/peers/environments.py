@@ -23,6 +23,7 @@ NEEDS = {
     ),
     "wire-mavsdk": (("mavsdk==4.1.0",),),
     "wire-dronekit2": (("dronekit2==3.0.0",),),
+    "page-playwright": (("playwright>=1.49",),),  # the browser itself is the system's, or playwright's where fetched
 }
 _ENOUGH_S = 300.0
 
