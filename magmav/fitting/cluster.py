@@ -43,7 +43,7 @@ def on_cluster(
             raise ClusterError(f"--dask {address}: the cluster has no workers; start some with `dask worker {address}`")
         told = client.scatter((settings, options), broadcast=True, hash=False)
         running: dict[Any, Job] = {}
-        ended = dask.as_completed()
+        ended = dask.as_completed(loop=client.loop)
 
         def feed() -> None:
             while len(running) < _AHEAD * threads and (job := next(jobs, None)) is not None:

@@ -115,7 +115,7 @@ def fit_many(
     out = Run()
 
     def failed(path: str, text: str) -> None:
-        _put(out, path, refused(text), tell)
+        _put(out, shown(path), refused(shown(text)), tell)
 
     paths = find_logs(given, failed)
     tell(Told("found", total=len(paths)))
@@ -165,7 +165,12 @@ def _hashed(path: Path, failed: Callable[[str, str], None]) -> Job | None:
     except OSError as error:
         failed(str(path), f"{path}: cannot be read: {error.strerror}; look at its permissions, or copy it again")
         return None
-    return Job(str(path), os.path.abspath(path), sha256, size)
+    return Job(shown(path), os.path.abspath(path), sha256, size)
+
+
+def shown(path: str | Path) -> str:
+    """The name as text that any file can hold; a name's bytes need not be UTF-8."""
+    return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def _put(

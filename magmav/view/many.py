@@ -204,8 +204,11 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _safe(value: Any) -> Any:
-    """A file's name may begin like a formula; a spreadsheet must not run it."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@") else value
+    """A file's name may hold a line's end, or begin like a formula; a spreadsheet must not run it."""
+    if not isinstance(value, str):
+        return value
+    value = "".join(c if c.isprintable() else "?" for c in value)
+    return f"'{value}" if value[:1] in ("=", "+", "-", "@") else value
 
 
 def _line(text: str) -> Text:
