@@ -34,6 +34,7 @@ soak: $(VENV)/.ready
 	$(BIN)/python benchmarks/soak.py
 	$(BIN)/python benchmarks/soak_upload.py
 	$(BIN)/python benchmarks/fuzz_wire.py
+	$(BIN)/python benchmarks/damaged_logs.py
 	$(BIN)/python benchmarks/day.py
 
 # The last wants a real .bin log and says so (exit 3) where there is none.
