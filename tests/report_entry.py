@@ -79,25 +79,29 @@ def fit(state: str) -> Json:
         "sigma_mg": [1.5, 1.25, 5.75],
         "axes": ["OBSERVED", "OBSERVED", "FROM_MODEL"],
         "hard_iron_mg": [100.0, -50.0, -30.0],
+        "hard_iron_at": "average power",
+        "changes_s": [88.5],
         "soft_iron": {
             "matrix": [[1.01, 0.02, 0.03], [0.02, 0.99, 0.04], [0.03, 0.04, 1.05]],
             "sigma": [[0.001, 0.002, 0.003], [0.002, 0.004, 0.005], [0.003, 0.005, 0.006]],
             "earned": False,
             "asked": True,
         },
-        "motor": {"mg_per_unit": [1.5, -2.5, 3.5], "of": "current", "earned": True, "asked": True},
+        "motor": {"mg_per_unit": [1.5, -2.5, 3.5], "of": "current", "earned": True, "asked": True, "evidence": "0.9"},
         "scale": {"value": 1.125, "sigma": 0.0625, "earned": True, "asked": False},
         "parameters": {
             "autopilot": "ardupilot",
             "old": {"COMPASS_OFS_X": 11.0, "COMPASS_OFS_Y": None, "COMPASS_ORIENT": 0.0},
             "new": {"COMPASS_OFS_X": -100.5, "COMPASS_OFS_Y": 51.5, "COMPASS_ORIENT": 0.0},
             "changed": {"COMPASS_OFS_X": -100.5, "COMPASS_OFS_Y": 51.5},
+            "closure_mg": 0.0125,
         },
         "residual_mg": {"before": 120.25, "after": 6.25, "held_out_before": 118.25, "held_out_after": 7.75},
         "heading": {
             "reference": "GPS yaw",
             "before": {"rms_deg": 40.25, "p95_deg": 77.5, "n": 900},
             "after": {"rms_deg": 3.25, "p95_deg": 6.5, "n": 901},
+            "excluded": {"tilt over 60 deg": 41, "disarmed": 12},
             "held_out": {
                 "before": {"rms_deg": 41.5, "p95_deg": 78.5, "n": 450},
                 "after": {"rms_deg": 3.75, "p95_deg": 7.25, "n": 451},
@@ -112,6 +116,7 @@ def fit(state: str) -> Json:
         "deviation": card,
         "coverage": {"directions": rays, "share": 0.625},
         "series": series(),
+        "something_new": [1.5, "a later version's"],
     })  # fmt: skip
 
 

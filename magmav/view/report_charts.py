@@ -201,11 +201,11 @@ def offsets(series: Json, cut: Sequence[Json], iron_mg: Sequence[Number] | None)
     said = "Offsets of each moment: " + ", ".join(told) + "."
     keys = [
         swatch(_banded, "offset of the moment, one sigma"),
-        line_key("the fit's answer", INK, "2 3", 1.6),
+        *([line_key("the fit's answer", INK, "2 3", 1.6)] if iron_mg else []),
         *_cut_key(cut),
     ]
     caption = f"{said} Run both ways, so that each moment knows what came later too. "
-    caption += "Without soft iron and power: the values to store are in the table of offsets."
+    caption += "Without soft iron, at the power of the moment: the values to store are in the table of offsets."
     return picture("Offsets over time", said, 302, panels, keys, caption)
 
 

@@ -15,9 +15,14 @@ _WAYS = {
     "uncalibrated": "no calibration at all",
     "before": "as stored",
     "after": "new offsets",
-    "full": "with soft iron and motor terms",
-    "path": "iron of each moment, soft iron",
+    "full": "full model, iron of each moment",
 }
+_NAMES = (
+    "state reasons causes advice device_id relative span_s cut old_offsets_mg new_offsets_mg change_mg sigma_mg axes "
+    "hard_iron_mg hard_iron_at soft_iron motor scale changes_s parameters residual_mg heading mounting odd_one_out "
+    "deviation coverage series"
+)
+_SHOWN = frozenset(_NAMES.split())  # what comes new into a fit is shown by its own name
 _PARTS = {"soft_iron": "soft iron", "motor": "motor and current", "scale": "scale"}
 
 
@@ -31,7 +36,7 @@ def compass_section(vehicle: Json, compass: Json, anchor: str, first: bool) -> M
         tag("h2", f"{name}, device {word(device)}"),
         _verdict(compass),
         () if fit is None else _of_fit(fit),
-        _live(compass),
+        _recorded(compass),
         id=anchor,
         class_="compass first" if first else "compass",
     )
@@ -61,7 +66,7 @@ def _of_fit(fit: Json) -> list[Child]:
         charts.coverage(fit.get("coverage") or {}),
         charts.field(series, cut),
         charts.heading(series, cut, heading.get("reference")),
-        charts.offsets(series, cut, fit.get("hard_iron_mg")),
+        charts.offsets(series, cut, None if fit.get("hard_iron_at") == "zero power" else fit.get("hard_iron_mg")),
     ]
     return [
         tag(
@@ -85,8 +90,8 @@ def _values(fit: Json) -> list[Child]:
     axes = [word(_item(fit.get("axes"), i)) for i in range(3)]
     rows.append(("how it is known", *(tag("span", AXES.get(axis, axis)) for axis in axes)))
     note = (
-        "Body axes, mG, as ArduPilot would add them. Hard iron is what the sensor itself carries, with no current "
-        "flowing, and is subtracted."
+        "Body axes, mG, as ArduPilot would add them. Hard iron is what the sensor itself carries, at "
+        f"{word(fit.get('hard_iron_at'))}, and is subtracted."
     )
     if fit.get("relative"):
         note += " Relative: add the change to what is stored; the values to store are not known."
@@ -108,10 +113,15 @@ def _parameters(named: Json) -> list[Child]:
     kind = str(named.get("autopilot"))
     kind = {name.lower(): name for name in AUTOPILOTS.values()}.get(kind, word(named.get("autopilot")))
     title = tag("h3", f"Parameters of the autopilot ({kind})")
+    closure = number(named.get("closure_mg"), ".3g", "mG")
+    proof = tag(
+        "p", f"With these the autopilot makes the field that the fit foretells, within {closure}.", class_="quiet"
+    )
     if not names:
         return [title, tag("p", "No parameter is to be changed, or which ones belong to this compass is not known.")]
     rows = [(n, exact(old.get(n)), exact(new.get(n)), tag("span", _write(n, new.get(n), changed))) for n in names]
-    return [title, table(("parameter", "stored", "new", ""), rows, changed=[n in changed for n in names])]
+    whole = table(("parameter", "stored", "new", ""), rows, changed=[n in changed for n in names])
+    return [title, whole, proof if named.get("closure_mg") is not None else None]
 
 
 def _write(name: str, new: Any, changed: Json) -> str:
@@ -134,7 +144,7 @@ def _heading(heading: Json | None) -> list[Child]:
         title = tag("h3", "Heading error")
         return [title, tag("p", "Heading error: not known, there is no reference to measure it against.")]
     held = heading.get("held_out") or {}
-    scores = [(_WAYS.get(k, k), v) for k, v in heading.items() if isinstance(v, Mapping) and k != "held_out"]
+    scores = [(_WAYS.get(k, k), v) for k, v in heading.items() if isinstance(v, Mapping) and "rms_deg" in v]
     scores += [(f"held out: {_WAYS.get(k, k)}", v) for k, v in held.items() if isinstance(v, Mapping)]
     rows = [
         (name, number(s.get("rms_deg"), ".2f"), number(s.get("p95_deg"), ".2f"), number(s.get("n"), "d"))
@@ -142,6 +152,8 @@ def _heading(heading: Json | None) -> list[Child]:
     ]
     reference = word(heading.get("reference"))
     how = f"Held out: {held['how']}." if held.get("how") else "No part of the flight was held out."
+    left_out = ", ".join(f"{word(k)} {word(n)}" for k, n in (heading.get("excluded") or {}).items() if n)
+    how += f" Samples left out of the score: {left_out}." if left_out else ""
     if reference.startswith("ATTITUDE"):
         how += " Yaw of an autopilot usually follows its own compass: agreeing with it proves little."
     head = ("calibration", "RMS", "95 % within", "samples")
@@ -179,6 +191,10 @@ def _spans(fit: Json) -> list[Child]:
             for c in cut
         ]
         out.append(table(("left out, s", tag("span", "why")), rows))
+    changes = fit.get("changes_s")
+    if changes:
+        told = ", ".join(number(t, ".1f") for t in changes)
+        out.append(tag("p", f"The iron on board changed at {told} s: the answer is that of what came after."))
     return out
 
 
@@ -195,39 +211,37 @@ def _beyond(fit: Json) -> list[Child]:
         ("orientation stored", word(mounting.get("stored_orientation"))),
         ("the bad one on board", "yes, of the compasses it fits the motion worst" if fit.get("odd_one_out") else "no"),
     ]
-    for key, name in _PARTS.items():
-        pairs.append((name, _part(fit.get(key))))
+    pairs += [(name, _part(fit.get(key))) for key, name in _PARTS.items()]
+    pairs += [(key.replace("_", " "), word(value)) for key, value in fit.items() if key not in _SHOWN]
     return [tag("h3", "Mounting and terms beyond offsets"), facts(pairs)]
 
 
 def _part(part: Any) -> str:
-    """Asked and earned first, because a term that is not earned is not used."""
+    """Asked and earned first, because a term that is not both is not used."""
     if not isinstance(part, Mapping):
         return "not fitted"
-    earned = "earned" if part.get("earned") else "not earned, not used"
-    asked = "asked for" if part.get("asked") else "not asked for"
+    asked, earned = (part.get(k) for k in ("asked", "earned"))
+    told = f"{'asked for' if asked else 'not asked for'}, {'earned' if earned else 'not earned'}"
+    told += ", used" if asked and earned else ", not used"
     rest = "; ".join(f"{k.replace('_', ' ')}: {word(v)}" for k, v in part.items() if k not in ("asked", "earned"))
-    return f"{asked}, {earned}. {rest}"
+    return f"{told}. {rest}"
 
 
-def _live(compass: Json) -> list[Child]:
-    """What the service would have known in flight: the rest of the entry."""
-    heading, only = (compass.get(k) or {} for k in ("heading", "heading_offsets_only"))
-    offsets, sigma = compass.get("offsets_mg"), compass.get("sigma_mg")
-    pairs: list[tuple[str, Child]] = [("state at the end", title_of(compass.get("state")))]
-    if compass.get("reasons"):
-        pairs.append(("why", bullets(lines(compass["reasons"]))))
-    pairs.append(("offsets, mG", _three(offsets, sigma)))
-    if compass.get("offsets_change_mg") is not None:
-        pairs.append(("change of offsets, mG", _three(compass["offsets_change_mg"], sigma)))
+def _recorded(compass: Json) -> list[Child]:
+    """The rest of the entry; offsets and heading only where no fit has said them already."""
+    pairs: list[tuple[str, Child]] = []
+    if compass.get("fit") is None:
+        offsets, sigma, heading = (compass.get(k) for k in ("offsets_mg", "sigma_mg", "heading"))
+        pairs.append(("offsets known in flight, mG", _three(offsets, sigma)))
+        if heading and heading.get("reference") is not None:
+            told = f"{number(heading.get('rms_deg'), '.2f')} deg RMS, as known in flight"
+            pairs.append((f"heading against {word(heading['reference'])}", told))
     pairs.append(("samples", f"{word(compass.get('samples'))}, {word(compass.get('samples_learnt'))} of them taught"))
-    if heading.get("reference") is not None:
-        told = f"{number(heading.get('rms_deg'), '.2f')} deg RMS with the full model"
-        told += f", {number(only.get('rms_deg'), '.2f')} with offsets alone" if only else ""
-        pairs.append((f"heading against {word(heading['reference'])}", told))
+    if compass.get("delay_s") is not None:
+        pairs.append(("field against attitude", f"{number(compass['delay_s'], '+.3f')} s late"))
     stored = compass.get("stored") or {}
     pairs.append(("the autopilot held", ", ".join(f"{k} {exact(v)}" for k, v in stored.items()) or word(None)))
-    return [tag("h3", "What the service would have known in flight"), facts(pairs)]
+    return [tag("h3", "From the recording"), facts(pairs)]
 
 
 def _three(values: Any, sigmas: Any) -> str:

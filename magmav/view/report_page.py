@@ -176,7 +176,8 @@ def word(value: Any) -> str:
     if isinstance(value, float):
         return format(value, ".9g")
     if isinstance(value, list | tuple):
-        return ", ".join(word(v) for v in value)
+        between = "; " if value and isinstance(value[0], list | tuple) else ", "
+        return between.join(word(v) for v in value)
     if isinstance(value, dict):
         return ", ".join(f"{k} {word(v)}" for k, v in value.items())
     return str(value)
