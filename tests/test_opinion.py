@@ -138,10 +138,14 @@ def test_where_soft_iron_is_believed_the_second_is_doubted_unless_the_tilt_is_it
         e._own_tilt = own_tilt
         got, after, _, apart = e._joined(mean, take, p @ take.T, before, before, EXPECTED)
         assert apart == pytest.approx(1.0)  # neither doubt makes them agree any better
-        mine = Tuning().own_tilt_joined * before if own_tilt else before
-        much = np.linalg.solve(theirs, np.linalg.inv(np.linalg.inv(after) - np.linalg.inv(mine)))
-        pulled = mine @ np.linalg.solve(mine + much[0, 0] * theirs, iron - take @ mean)
-        assert take @ (got - mean) == pytest.approx(pulled, rel=1e-4)
+        if own_tilt:
+            wide = Tuning().own_tilt_joined * before
+            gain = wide @ np.linalg.inv(wide + theirs)
+            assert take @ (got - mean) == pytest.approx(gain @ (iron - take @ mean), rel=1e-6)
+            left = np.eye(3) - gain  # the error of what was weighed so, were both claims true
+            assert after == pytest.approx(left @ before @ left.T + gain @ theirs @ gain.T, rel=1e-6)
+            return 1.0
+        much = np.linalg.solve(theirs, np.linalg.inv(np.linalg.inv(after) - np.linalg.inv(before)))
         assert much == pytest.approx(much[0, 0] * np.eye(3), abs=1e-5 * much[0, 0])
         return float(much[0, 0])
 

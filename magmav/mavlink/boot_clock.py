@@ -78,6 +78,8 @@ class BootClock:
 
     def _confirms(self, boot_ms: int, now_ns: int, first_ms: int, first_ns: int) -> bool:
         """The same new time, far enough on. Where only the silence speaks, longer: held-back packets catch up."""
+        apart_ms = (now_ns - first_ns) // _MS
         if self.ms is not None and -BACK_MS <= boot_ms - self.ms <= self._passed_ms(now_ns):
-            return (now_ns - first_ns) // _MS >= _LAG_APART_MS
-        return boot_ms - first_ms >= _APART_MS
+            return apart_ms >= _LAG_APART_MS
+        # No clock runs ahead of the time that passed: such a packet lies, and what is true comes after it.
+        return _APART_MS <= boot_ms - first_ms <= apart_ms + BACK_MS

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.answer import surprise, symmetric, without_prior
+from magmav.core.estimators.adaptive.answer import surprise, without_prior
 from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
-from magmav.core.estimators.adaptive.opinion import doubt, known, own_covariance, stale
+from magmav.core.estimators.adaptive.opinion import doubt, joined, known, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
@@ -350,15 +350,14 @@ class AdaptiveEstimator:
         apart = distance(off, iron_mg2, said.covariance_mg2)
         if self._is_stale():
             return mean, iron_mg2, own_mg2, apart
-        much = doubt(apart)
+        much, less = doubt(apart), 1.0
         if self._own_tilt:
             less = self.tuning.own_tilt_joined
-            pulled, iron_mg2, own_mg2 = less * pulled, less * iron_mg2, less * own_mg2
         else:
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
         motors = self._motors_mg2(mean)
-        weight = np.linalg.inv(iron_mg2 + much * known(said.covariance_mg2) + motors)
-        mean = mean + pulled @ (weight @ off)
-        iron_mg2 = iron_mg2 - iron_mg2 @ weight @ iron_mg2
-        own_mg2 = own_mg2 - own_mg2 @ np.linalg.solve(own_mg2 + much * known(own_covariance(said)) + motors, own_mg2)
-        return mean, symmetric(iron_mg2), symmetric(own_mg2), apart
+        theirs_mg2 = much * known(said.covariance_mg2) + motors
+        mean = mean + less * pulled @ np.linalg.solve(less * iron_mg2 + theirs_mg2, off)
+        iron_mg2 = joined(iron_mg2, theirs_mg2, less)
+        own_mg2 = joined(own_mg2, much * known(own_covariance(said)) + motors, less)
+        return mean, iron_mg2, own_mg2, apart

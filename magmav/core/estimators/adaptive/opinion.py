@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from magmav.core.estimators.adaptive.answer import symmetric
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.twostep import KNOWS_MG, TwostepEstimator
 from magmav.core.types import Estimate
@@ -26,6 +27,16 @@ def stale(second: TwostepEstimator, changed_ago_s: float) -> bool:
 def doubt(apart: float) -> float:
     """By what the second's variance is multiplied when the two are so many sigmas apart."""
     return max(1.0, apart / _APART) ** 4
+
+
+def joined(ours_mg2: Array, theirs_mg2: Array, less: float) -> Array:
+    """Covariance (3, 3) of both together where ours is weighed as if its variances were ``less`` times as large.
+
+    What is claimed is ours as it is (Joseph's form): who learns nothing from the second claims no more and no less.
+    """
+    gain = less * ours_mg2 @ np.linalg.inv(less * ours_mg2 + theirs_mg2)
+    left = np.eye(3) - gain
+    return symmetric(left @ ours_mg2 @ left.T + gain @ theirs_mg2 @ gain.T)
 
 
 def known(iron_mg2: Array) -> Array:

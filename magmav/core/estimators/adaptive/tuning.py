@@ -65,7 +65,7 @@ class Tuning:
     own_tilt_doubt: float = 3.0  # times what gyro and accelerometer claim of their tilt: the error goes with the motion
     own_tilt_most_rad: float = math.radians(30.0)  # beyond it the equation is no turn any more
     own_tilt_tau_s: float = 3.0
-    own_tilt_joined: float = 9.0  # times what the bank then claims, squared, where the second opinion is heard
+    own_tilt_joined: float = 2.0  # times the variance it then has against the second opinion
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
     disturbance_hi_mg: float = 7.0
