@@ -20,10 +20,10 @@ from typing import Any
 __version__ = "0.1.0"
 
 _WHERE = {
-    "replay": "magmav.recording",
+    "replay": "magmav.library",
     "NothingToLearnFrom": "magmav.recording",
     "open_recording": "magmav.recording",
-    "fit": "magmav.fitting",
+    "fit": "magmav.library",
     "FitOptions": "magmav.fitting",
     "Settings": "magmav.settings",
     "load_settings": "magmav.settings",

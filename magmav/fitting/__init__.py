@@ -13,18 +13,21 @@ from typing import Any
 
 from magmav import __version__
 from magmav.core.types import FieldModel
-from magmav.fitting.answer import Told, answer
+from magmav.fitting.answer import answer
+from magmav.fitting.case import Case, Told, solve
 from magmav.fitting.dated import Dated
 from magmav.fitting.tape import Recorder
+from magmav.fitting.why import asked
 from magmav.geomag import world_magnetic_model
 from magmav.logs import HEAD, Progress, kind_of
 from magmav.recording import open_recording, replay
 from magmav.reference import Reference
-from magmav.settings import Settings
+from magmav.settings import Settings, with_value
 from magmav.vehicle import Boot, Vehicle
 
 Result = dict[str, Any]
 _CHUNK = 1 << 20
+_QUICK = "minmax"  # while the recording is played; what counts is learnt from its Samples afterwards
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +51,11 @@ def fit(
     options: FitOptions = FitOptions(),
     progress: Progress | None = None,
     model: FieldModel = world_magnetic_model,
+    arrays: dict[tuple[int, int], dict[str, Any]] | None = None,
 ) -> Result:
     """One log's entry of what ``magmav fit --json`` prints: the document of ``replay`` with ``fit`` in each compass.
 
+    arrays : filled with numpy arrays by system and compass, see ``magmav.library.fit``.
     Raises LogError or LinkError for a file that cannot be read, NothingToLearnFrom where no compass was heard,
     TruthError for a bad reference file, ValueError for a compass that is not 1, 2 or 3.
     """
@@ -65,7 +70,7 @@ def fit(
     try:
         result = replay(
             recording,
-            settings,
+            with_value(settings, "learn", "estimator", _QUICK),
             model,
             source=str(path),
             reference_csv=None if options.heading_reference is None else Path(options.heading_reference),
@@ -80,14 +85,29 @@ def fit(
     for vehicle in result["vehicles"]:
         system = vehicle["system"]
         told = Told(
-            system, vehicle["autopilot"], boots[system], references.get(system), recorder.currents(system), settings
+            system,
+            vehicle["autopilot"],
+            boots[system],
+            references.get(system),
+            recorder.currents(system),
+            recorder.parameters(system),
+            recorder.moved_s(system),
+            settings,
         )
+        cases: dict[int, Case] = {}
         for entry in vehicle["compasses"]:
-            entry["fit"] = None
-            tape = recorder.tapes.get((system, entry["compass"]))
-            if tape is None or (options.compasses and entry["compass"] not in options.compasses):
-                continue
-            answer(entry, tape, told, options)
+            entry["fit"], compass = None, entry["compass"]
+            tape = recorder.tapes.get((system, compass))
+            case = None if tape is None else solve(compass, tape, told)
+            if case is not None:
+                cases[compass] = case
+        found, finder = asked(list(cases.values()))
+        for entry in vehicle["compasses"]:
+            chosen = not options.compasses or entry["compass"] in options.compasses
+            if entry["compass"] in cases and chosen:
+                got = answer(entry, cases[entry["compass"]], found[entry["compass"]], finder, options)
+                if arrays is not None:
+                    arrays[system, entry["compass"]] = got
     result["file"] = file_facts(path) | {"began_unix_s": dated.unix_s(recording.unix_offset_ns)}
     result["made_by"] = {"magmav": __version__, "at": None}
     return result

@@ -28,8 +28,13 @@ _FLOOR_MG = np.array([1.5, 1.5, 5.5])  # as the estimator's own
 _NO_WORSE = 1.25  # the reference itself follows some compass
 
 
-def answer(entry: Result, case: Case, found: tuple[Cause, ...], finder: Causes, options: FitOptions) -> None:
-    """Put the fit of one compass into its entry, and what the entry says of it as of after the flight."""
+def answer(
+    entry: Result, case: Case, found: tuple[Cause, ...], finder: Causes, options: FitOptions
+) -> dict[str, NDArray[Any]]:
+    """Put the fit of one compass into its entry, and what the entry says of it as of after the flight.
+
+    What it rests on as arrays, (N,) or (N, 3): see ``magmav.library.fit``.
+    """
     held, compass = case.told.boot.calibrations, case.compass
     verdict, sigma = judged(case, finder)
     b = why.batch(case)
@@ -97,6 +102,18 @@ def answer(entry: Result, case: Case, found: tuple[Cause, ...], finder: Causes, 
         ),
     }
     _rewrite(entry, verdict, offsets_mg, hard_iron, sigma, heading, relative)
+    return {
+        "boot_s": case.columns.boot_s,
+        "sensor_b_mg": np.array([s.mag_b_mg for s in case.samples]),
+        "before_b_mg": before_b,
+        "after_b_mg": after_b,
+        "hard_iron_b_mg": case.known.iron_of(case.samples),
+        "roll_rad": case.columns.roll_rad,
+        "pitch_rad": case.columns.pitch_rad,
+        "taught": taught,
+        "throttle": case.columns.throttle,
+        "ampere": case.ampere,
+    }
 
 
 def _one_set(case: Case, b: why.Batch, t: Terms) -> tuple[Vec3, Vec3]:
