@@ -1,0 +1,184 @@
+"""What a whole `magmav fit` costs: on a written hour of flight, and beside MAVProxy's magfit on a real log."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from estimator_bench.peer_environments import NoEnvironment, python_of
+from estimator_cost import packets, parsed_s
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from rich.console import Console
+
+from magmav.comparison import Columns, Tape, first_half, scored
+from magmav.core.after_flight import after_flight
+from magmav.core.channel import Circumstances
+from magmav.core.types import Sample
+from magmav.geomag import world_magnetic_model
+from magmav.recording import open_recording, replay
+from magmav.reference import Reference
+from magmav.score import Calibration, Window
+from magmav.settings import Settings
+
+_IRONS = {2: (40, -25, 90), 3: (-150, 60, -30)}  # mG beside the first compass's
+_TWINS = {2: dialect.MAVLink_scaled_imu2_message, 3: dialect.MAVLink_scaled_imu3_message}
+_MAGFIT = """
+import sys, types
+class Nothing(types.ModuleType):
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return type(name, (), {})
+for module in ("wx", "wx.lib", "wx.lib.agw", "wx.grid", "wx.dataview"):
+    sys.modules[module] = Nothing(module)
+from MAVProxy.modules.lib import magfit
+path, mag, until_s, plot = sys.argv[1], sys.argv[2], float(sys.argv[3]), sys.argv[4]
+whole = magfit.magfit
+def within(mlog, in_range, save_plot=None):
+    first = mlog.recv_match(type=["ATT"])
+    start = first._timestamp - 1e-6 * first.TimeUS
+    return whole(mlog, lambda t: 1 if t - start > until_s else 0, save_plot=save_plot)
+magfit.magfit = within
+sys.argv = ["magfit", path, "--mag", mag, "--save-plot", plot]
+magfit.main()
+"""
+_NEW = re.compile(r"^New: Vector3\(([^,]+), ([^,]+), ([^)]+)\)", re.MULTILINE)
+
+
+class Spent(NamedTuple):
+    """A process that ended: processor seconds, the most memory it held, and what it printed."""
+
+    cpu_s: float
+    rss_mb: float
+    out: str
+
+
+def spent(command: list[str]) -> Spent:
+    """Run it. RuntimeError where it fails."""
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        child = subprocess.Popen(command, stdout=out, stderr=err)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        out.seek(0)
+        err.seek(0)
+        if child.returncode != 0:
+            raise RuntimeError(f"{' '.join(command[:4])}: exit code {child.returncode}: {err.read()[-500:]!r}")
+        return Spent(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0, out.read().decode())
+
+
+def fitted(path: Path, folder: Path) -> tuple[Spent, dict[str, Any]]:
+    """`magmav fit --json` of one log, in a process of its own; and its entry."""
+    got = spent([sys.executable, "-m", "magmav.cli", "fit", str(path), "--json", "--out", str(folder / "out")])
+    return got, json.loads(got.out)["logs"][0]
+
+
+# ---------------------------------------------------------------- the hour
+
+
+def with_twins(seconds: float) -> Iterator[tuple[int, bytes]]:
+    """The flight of estimator_cost with a second and a third compass in it."""
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    reader = dialect.MAVLink(None)
+    first = True
+    for us, frame in packets(seconds):
+        for compass in _TWINS if first else ():
+            told = [(f"COMPASS_OFS{compass}_{axis}", 0.0) for axis in "XYZ"]
+            told += [(f"COMPASS_{name}{compass}", 0.0) for name in ("ORIENT", "EXTERN", "SCALE")]
+            for name, value in [*told, (f"COMPASS_DEV_ID{compass}", 97539.0 + compass)]:
+                message = dialect.MAVLink_param_value_message(name.encode(), value, 9, 900, 65535)
+                yield us, bytes(message.pack(mav))
+        first = False
+        yield us, frame
+        if frame[7] == dialect.MAVLINK_MSG_ID_RAW_IMU:
+            m = reader.decode(bytearray(frame))
+            for compass, kind in _TWINS.items():
+                x, y, z = (v + iron for v, iron in zip((m.xmag, m.ymag, m.zmag), _IRONS[compass], strict=True))
+                twin = kind(m.time_usec // 1000, m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro, x, y, z)
+                yield us, bytes(twin.pack(mav))
+
+
+def hour(minutes: float, console: Console) -> None:
+    """One compass, then three."""
+    with tempfile.TemporaryDirectory(prefix="magmav-hour-") as place:
+        folder = Path(place)
+        for many, flight in ((1, packets), (3, with_twins)):
+            path = folder / f"hour{many}.tlog"
+            frames = []
+            with path.open("wb") as file:
+                for us, frame in flight(60.0 * minutes):
+                    file.write(us.to_bytes(8, "big") + frame)
+                    frames.append(frame)
+            parse_s = parsed_s(frames)
+            got, entry = fitted(path, folder)
+            compasses = entry["vehicles"][0]["compasses"]
+            if len(compasses) != many or any(c["fit"] is None for c in compasses):
+                raise RuntimeError(f"{path.name}: not all of {many} compasses were fitted")
+            console.print(
+                f"{many} compass{'es' if many > 1 else ''}, {minutes:g} min, {len(frames)} messages: "
+                f"fit {got.cpu_s:.1f} s of processor time, {got.rss_mb:.0f} MB; "
+                f"pymavlink's bare parse {parse_s:.1f} s, ratio {got.cpu_s / parse_s:.2f}"
+            )
+
+
+# ---------------------------------------------------------------- beside magfit
+
+
+def magfit(path: Path, console: Console) -> int:
+    """Both on all compasses of one DataFlash log; 3 where magfit cannot be had."""
+    try:
+        python = str(python_of("mavproxy", console.print))
+    except NoEnvironment as error:
+        console.print(str(error))
+        return 3
+    tapes, references = taped(path)
+    system = next(iter(references))
+    with tempfile.TemporaryDirectory(prefix="magmav-magfit-") as place:
+        folder = Path(place)
+        mine, _ = fitted(path, folder)
+        theirs_s = 0.0
+        for (_, compass), tape in sorted(tapes.items()):
+            columns = Columns.of(tape.heard)
+            half = first_half(columns)
+            split_s = float(columns.boot_s[half])
+            asked = [python, "-c", _MAGFIT, str(path), f"MAG[{compass - 1}]"]
+            theirs_s += spent([*asked, "1e12", str(folder / "a.png")]).cpu_s
+            held = _NEW.search(spent([*asked, f"{split_s:.3f}", str(folder / "b.png")]).out)
+            known = after_flight([h.sample for h in tape.heard[:half]])
+            marks = {}
+            if held is not None:
+                marks["magfit"] = Calibration(-np.array([float(v) for v in held.groups()]), np.eye(3), None)
+            if known is not None:
+                matrix = known.answer.soft_iron_b @ tape.heard[-1].sample.shaping.matrix
+                marks["magmav"] = Calibration(known.answer.hard_iron_b_mg, matrix, None)
+            scores, name = scored(columns, marks, references[system], Window(split_s))
+            said = ", ".join(f"{k} {s.rms_deg:.2f}" for k, s in scores.items() if k in (*marks, "uncalibrated"))
+            console.print(
+                f"compass {compass}, fitted up to {split_s:.0f} s, heading RMS after it, deg: {said} ({name})"
+            )
+    console.print(
+        f"magmav fit, all compasses {mine.cpu_s:.1f} s, {mine.rss_mb:.0f} MB; magfit, one run each, {theirs_s:.1f} s; "
+        f"ratio {theirs_s / mine.cpu_s:.1f}"
+    )
+    return 0
+
+
+def taped(path: Path) -> tuple[dict[tuple[int, int], Tape], dict[int, Reference]]:
+    """What each compass had to learn from, and what headings are held against."""
+    tapes: dict[tuple[int, int], Tape] = {}
+    references: dict[int, Reference] = {}
+
+    def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
+        tapes.setdefault((sample.system, sample.compass), Tape()).add(sample, circumstances, stretch)
+
+    replay(open_recording(path), Settings(), world_magnetic_model, references=references, tap=tap)
+    for tape in tapes.values():
+        tape.close()
+    return tapes, references
