@@ -43,4 +43,7 @@ def write_parameters(entry: dict[str, Any], path: Path) -> None:
     """What changed, as the file's ending says: .params for QGroundControl, else NAME,VALUE."""
     from magmav.fitting.parameters import file_of
 
-    path.write_text(file_of(entry, path.suffix), encoding="utf-8")
+    text = file_of(entry, path.suffix)
+    half = path.with_name(f"{path.name}.part")
+    half.write_text(text, encoding="utf-8")
+    half.replace(path)  # whole or not at all
