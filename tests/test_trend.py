@@ -60,9 +60,9 @@ def test_honest_scatter_is_rarely_called_a_change() -> None:
     assert sum(map(len, long)) / (100 * 19 * 3) < 0.002
 
 
-def test_a_drift_is_claimed_beyond_two_of_its_sigmas() -> None:
-    drifting = trend([row(d, (3.0 * d, 0, 0), (10, 10, 10)) for d in range(1, 11)])
-    assert drifting["changes"] == [] and drifting["drift"]["x"]["mg_per_flight"] == pytest.approx(3.0)
+def test_a_drift_is_claimed_beyond_three_of_its_sigmas() -> None:
+    drifting = trend([row(d, (3.5 * d, 3.0 * d, 0), (10, 10, 10)) for d in range(1, 11)])
+    assert drifting["changes"] == [] and drifting["drift"]["x"]["mg_per_flight"] == pytest.approx(3.5)
     assert drifting["drift"]["x"]["claimed"] and not drifting["drift"]["y"]["claimed"]
     sigma = 10.0 / np.sqrt(sum((d - 5.5) ** 2 for d in range(1, 11)))
     assert drifting["drift"]["x"]["sigma_mg_per_flight"] == pytest.approx(sigma, abs=1e-4)

@@ -13,11 +13,11 @@ from typing import Any
 
 Result = dict[str, Any]
 AXES = ("x", "y", "z")
-SIGMAS = 2.0
+SIGMAS, DRIFT_SIGMAS = 2.0, 3.0
 RULE = (
     "A change is claimed on an axis when a flight's offset is off the mean of the flights since the last change by "
     "more than two sigmas of the flight and two of the steadiest of those flights together; it came after the last "
-    "of them. A drift is claimed when the slope since the last change is beyond two of its sigmas, from three "
+    "of them. A drift is claimed when the slope since the last change is beyond three of its sigmas, from three "
     "flights on. Flights count that are READY, dated by the recording, and not relative; axes that were observed or "
     "taken from the field model. Offsets are as ArduPilot adds them, mG, body axes."
 )
@@ -155,7 +155,7 @@ def _drift(points: Sequence[tuple[int, Any, float, float]]) -> Result | None:
         "mg_per_flight": round(slope, 4),
         "sigma_mg_per_flight": round(sigma, 4),
         "flights": len(points),
-        "claimed": abs(slope) > SIGMAS * sigma,
+        "claimed": abs(slope) > DRIFT_SIGMAS * sigma,
     }
 
 

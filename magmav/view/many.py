@@ -20,11 +20,14 @@ _CSS = """
 body{margin:0 auto;max-width:76rem;padding:1rem;background:#fff;color:#1b1b1b;overflow-wrap:anywhere;
  font:16px/1.45 system-ui,"Segoe UI",Roboto,"Liberation Sans",Arial,sans-serif}
 h1{font-size:1.5rem}h2{font-size:1.2rem;margin:2rem 0 .3rem;border-top:2px solid #1b1b1b;padding-top:.5rem}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}
+.wide{overflow-x:auto}
+table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums;overflow-wrap:normal}
+td,th{white-space:nowrap}td:nth-child(2){white-space:normal;min-width:9rem;max-width:24rem;overflow-wrap:anywhere}
 th,td{padding:.2rem .8rem .2rem 0;text-align:right;vertical-align:top;border-bottom:1px solid #d0d0d0}
 th:first-child,td:first-child,td.w,th.w{text-align:left}tr.changed{font-weight:650}.quiet{color:#4a4a4a}
 svg{display:block;width:100%;max-width:52rem;height:auto}
-@media print{body{max-width:none;padding:0;font-size:9pt}h2,svg,tr{break-inside:avoid}}
+@media print{body{max-width:none;padding:0;font-size:9pt}table{font-size:7pt}th,td{padding-right:.4rem}
+ .wide{overflow:visible}h2,svg,tr{break-inside:avoid}h2{break-after:avoid}}
 """
 
 
@@ -163,16 +166,17 @@ def _picture(compass: Json) -> str:
         number = next(i for i, row in enumerate(rows) if row["sha256"] == c["found_in"]["sha256"])
         at = (x(number) + x(number - 1)) / 2.0
         parts.append(f'<path d="M{at:.1f} 10V{high - low}" stroke="#767676" stroke-dasharray="4 3" fill="none"/>')
+        parts.append(f'<text x="{at + 3:.1f}" y="20">{c["axis"]}</text>')
     for i, (axis, colour) in enumerate(zip(AXES, _COLOURS, strict=True)):
         points = [(x(n), row["new_offsets_mg"][i], row["sigma_mg"][i]) for n, row in enumerate(rows)]
         line = " ".join(f"{at:.1f},{y(value):.1f}" for at, value, _ in points)
         parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
         bars = "".join(f"M{at:.1f} {y(v - 2 * s):.1f}V{y(v + 2 * s):.1f}" for at, v, s in points)
         parts.append(f'<path d="{bars}" stroke="{colour}" fill="none" stroke-width="2"/>')
-        parts.append(f'<text x="{left + 10 + 90 * i}" y="{high - 2}" fill="{colour}">{axis}, mG</text>')
+        parts.append(f'<text x="{left + 10 + 90 * i}" y="{high - 8}" fill="{colour}">{axis}, mG</text>')
     first, last = rows[0]["date"][:10], rows[-1]["date"][:10]
-    parts.append(f'<text x="{wide}" y="{high - 2}" text-anchor="end">{first} to {last}, flight by flight</text>')
-    label = "Offsets of each flight with two sigmas; dashed: after this flight an axis changed"
+    parts.append(f'<text x="{wide}" y="{high - 8}" text-anchor="end">{first} to {last}, flight by flight</text>')
+    label = "Offsets of each flight with two sigmas; dashed: the axis named there changed"
     box_ = f'viewBox="0 0 {wide:.0f} {high:.0f}" font-size="12" role="img" aria-label="{label}"'
     return f"<svg {box_}>{''.join(parts)}</svg><p class=quiet>{label}.</p>"
 
