@@ -10,6 +10,7 @@ import hashlib
 import math
 import struct
 from collections.abc import Mapping
+from functools import lru_cache
 
 from magmav.core.types import Change, Reason
 from magmav.mavlink.autopilot.adapter import ADAPTERS, Adapter
@@ -18,6 +19,7 @@ from magmav.mavlink.float32 import float32, same
 CONFIRM_ABOVE_MG = 150.0
 
 
+@lru_cache(maxsize=64)  # asked at every turn of a write, of the same change
 def adapter_for(change: Change) -> Adapter:
     """The autopilot whose offsets these are. ValueError names what may not be written or does not fit."""
     why: list[ValueError] = []
