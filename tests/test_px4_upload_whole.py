@@ -93,7 +93,7 @@ def test_AT_4c_px4_after_the_reboot_it_is_said_whether_the_values_held_and_the_r
     flight.end()
 
 
-def test_S7_px4_that_calibrates_in_flight_is_not_written_to(tmp_path: Path) -> None:
+def test_S7_AT_18a_px4_that_calibrates_in_flight_is_not_written_to(tmp_path: Path) -> None:
     flight = Flight(Simulation(parse_scenario(PX4 % 1, "px4.toml"), 2), tmp_path)
     change = wanted(flight)
     assert ended(flight, change) == (UploadResult.REFUSED, (Reason.SECOND_WRITER,))

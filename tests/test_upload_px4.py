@@ -62,14 +62,14 @@ def test_px4_a_restore_brings_back_the_exact_values() -> None:
 
 
 @pytest.mark.parametrize("autocal", [1.0, -1.0])
-def test_S7_px4_in_flight_calibration_is_a_second_writer(autocal: float) -> None:
+def test_S7_AT_18a_px4_in_flight_calibration_is_a_second_writer(autocal: float) -> None:
     """-1 is a NaN on the wire, and nevertheless not 0."""
     rig = Px4Rig()
     rig.vehicle.params["SENS_MAG_AUTOCAL"] = autocal
     refused(rig, Reason.SECOND_WRITER)
 
 
-def test_S7_px4_whether_it_calibrates_in_flight_must_be_known() -> None:
+def test_S7_AT_18a_px4_whether_it_calibrates_in_flight_must_be_known() -> None:
     rig = Px4Rig()
     del rig.vehicle.params["SENS_MAG_AUTOCAL"]
     begin_ns = rig.vehicle.now_ns
@@ -77,7 +77,7 @@ def test_S7_px4_whether_it_calibrates_in_flight_must_be_known() -> None:
     assert rig.vehicle.now_ns - begin_ns <= 10.1 * S
 
 
-def test_S6_px4_another_device_in_the_slot_or_the_same_in_two_is_refused() -> None:
+def test_S6_AT_18a_px4_another_device_in_the_slot_or_the_same_in_two_is_refused() -> None:
     rig = Px4Rig()
     rig.vehicle.params["CAL_MAG1_ID"] = 97540.0
     refused(rig, Reason.DEVICE_CHANGED)
