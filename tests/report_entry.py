@@ -110,7 +110,12 @@ def fit(state: str) -> Json:
         },
         "mounting": {
             "stored_orientation": 4,
-            "found": {"rotation": "YAW_90", "angle_deg": 91.5, "text": "mounted turned by 91.5 degrees"},
+            "found": {
+                "rotation": "YAW_90",
+                "angle_deg": 91.5,
+                "text": "mounted turned by 91.5 degrees",
+                "set": {"name": "COMPASS_ORIENT", "value": 2},
+            },
         },
         "odd_one_out": False,
         "deviation": card,

@@ -334,3 +334,20 @@ def test_a_disk_that_is_full_leaves_the_report_of_before(tmp_path):
     assert run.returncode == 1 and "refused:" in run.stderr and "a.html" in run.stderr
     assert path.read_text() == "the old one"
     assert [p.name for p in tmp_path.iterdir()] == ["a.html"]
+
+
+def test_S20_a_change_is_followed_by_a_restart_and_a_wait_before_a_take_off():
+    for advice in ([], ["load the parameter file"]):
+        text = " ".join(Seen(shown(report_html(put(single(), (*FIT, "advice"), advice)))).text)
+        assert "restart the autopilot, wait until it has settled" in text
+    learning = put(put(single(), (*FIT, "parameters", "changed"), {}), (*FIT, "state"), "LEARNING")
+    assert "restart the autopilot" not in " ".join(Seen(shown(report_html(learning))).text)
+
+
+def test_a_compass_that_is_not_ready_never_says_write():
+    """New values that were not earned stand there to be seen, with what to do with them: nothing."""
+    learning = put(single(), (*FIT, "parameters", "changed"), {})
+    learning = put(learning, (*FIT, "state"), "LEARNING")
+    text = " ".join(Seen(shown(report_html(learning))).text)
+    assert text.count("do not write") == 2 and "Do not store these offsets." in text
+    assert re.search(r"\bwrite\b", text.replace("do not write", "")) is None

@@ -67,7 +67,7 @@ def deviation(card: Sequence[Json]) -> Markup | None:
     said = f"Heading error on eight headings: largest {_largest(befores)} before and {_largest(afters)} after."
     keys = [
         swatch(lambda: [rule(1, 8, 33, 8, BEFORE, 1.6, "5 3"), mark(17, 8, "square", BEFORE)], "as stored"),
-        swatch(lambda: [rule(1, 8, 33, 8, AFTER, 1.8), mark(17, 8, "circle", AFTER)], "new offsets, with one sigma"),
+        swatch(lambda: [rule(1, 8, 33, 8, AFTER, 1.8), mark(17, 8, "circle", AFTER)], "new calibration, one sigma"),
     ]
     return picture("Deviation card", said, 212, panel.drawn(), keys, said)
 
@@ -148,8 +148,8 @@ def field(series: Json, cut: Sequence[Json]) -> Markup | None:
     said += (
         f"; {name} {number(min(finite(power)), '.3g')} to {number(max(finite(power)), '.3g', unit)}." if power else "."
     )
-    keys = [line_key("as stored", BEFORE), line_key("new offsets", AFTER)] if finite(before) else []
-    keys = keys or [line_key("new offsets", AFTER)]
+    keys = [line_key("as stored", BEFORE), line_key("new calibration", AFTER)] if finite(before) else []
+    keys = keys or [line_key("new calibration", AFTER)]
     keys += [line_key("field model", MODEL, "6 4")] if finite(model) else []
     keys += [area_key(f"{name}, on the right", _POWER, 0.4)] if power else []
     keys += _cut_key(cut)

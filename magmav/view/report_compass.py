@@ -14,7 +14,7 @@ Json = Mapping[str, Any]
 _WAYS = {
     "uncalibrated": "no calibration at all",
     "before": "as stored",
-    "after": "new offsets",
+    "after": "new calibration",
     "full": "full model, iron of each moment",
 }
 _NAMES = (
@@ -119,14 +119,17 @@ def _parameters(named: Json) -> list[Child]:
     )
     if not names:
         return [title, tag("p", "No parameter is to be changed, or which ones belong to this compass is not known.")]
-    rows = [(n, exact(old.get(n)), exact(new.get(n)), tag("span", _write(n, new.get(n), changed))) for n in names]
+    rows = [
+        (n, exact(old.get(n)), exact(new.get(n)), tag("span", _write(n, old.get(n), new.get(n), changed)))
+        for n in names
+    ]
     whole = table(("parameter", "stored", "new", ""), rows, changed=[n in changed for n in names])
     return [title, whole, proof if named.get("closure_mg") is not None else None]
 
 
-def _write(name: str, new: Any, changed: Json) -> str:
+def _write(name: str, old: Any, new: Any, changed: Json) -> str:
     if name not in changed:
-        return "stays"
+        return "stays" if old == new else "do not write"
     return "write" if changed[name] == new else f"write {exact(changed[name])}"
 
 
@@ -172,7 +175,7 @@ def _card(card: Sequence[Json]) -> list[Child]:
         rows.append((heading, number(row.get("before_deg"), "+.2f"), told))
     note = "Level vehicle: heading shown less the heading it is on, degrees, with one sigma of the new."
     return [
-        table(("heading", "as stored", "new offsets"), rows, "Deviation card, figures"),
+        table(("heading", "as stored", "new"), rows, "Deviation card, figures"),
         tag("p", note, class_="quiet"),
     ]
 
@@ -206,6 +209,7 @@ def _beyond(fit: Json) -> list[Child]:
     if found:
         turn, rotation = number(found.get("angle_deg"), ".1f"), word(found.get("rotation"))
         told = f"{word(found.get('text'))}: {turn} degrees, as rotation {rotation}"
+        told += "".join(f"; {k}: {word(v)}" for k, v in found.items() if k not in ("text", "angle_deg", "rotation"))
     pairs: list[tuple[str, Child]] = [
         ("mounting", told),
         ("orientation stored", word(mounting.get("stored_orientation"))),

@@ -23,11 +23,15 @@ _MEANS = {
 }
 _DO = {
     "READY": "On the ground and disarmed, store the changed parameters below (magmav upload, or the parameter file in "
-    "a ground station). Then check the heading against a direction you know before the next take-off.",
+    "a ground station).",
     "LEARNING": "Fly again: turn through all headings, and tilt where that is safe. Then fit that log, or both.",
     "REFUSED": "See the causes, mend what they name, fly again and fit again.",
     "NO_DATA": "See that the compass is plugged in and switched on, and that the log or stream holds its readings.",
 }
+_AFTERWARDS = (
+    "After any change: restart the autopilot, wait until it has settled, and check the heading against a direction you "
+    "know before the next take-off."
+)
 AXES = {"OBSERVED": "shown by motion", "FROM_MODEL": "from the field model", "NOT_OBSERVED": "not shown, left as it is"}
 AUTOPILOTS = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
 
@@ -81,17 +85,20 @@ def _falls(fit: Json) -> bool:
 
 
 def to_do(compass: Json) -> list[str]:
-    """Advice of the fit, else what the state asks for."""
+    """Advice of the fit, else what the state asks for; where something is to be written, what comes after (S20)."""
     fit = compass.get("fit")
     state = str((fit or compass).get("state"))
-    advice = [str(line) for line in (fit or {}).get("advice") or () if line]
-    if advice:
-        return advice
+    writes = state == "READY" and bool(((fit or {}).get("parameters") or {}).get("changed"))
+    advice = [str(line) for line in (fit or {}).get("advice") or () if line] or _asked(fit, state, writes)
+    return [*advice, _AFTERWARDS] if writes else advice
+
+
+def _asked(fit: Json | None, state: str, writes: bool) -> list[str]:
+    if state == "READY" and fit is None:
+        return [_DO["LEARNING"]]
     if state == "READY" and fit is not None and not _falls(fit):
         return ["What is stored does as well on the part that was held out: there is no need to change it."]
-    if fit is None and state == "READY":
-        return [_DO["LEARNING"]]
-    if state == "READY" and not (fit or {}).get("parameters", {}).get("changed"):
+    if state == "READY" and not writes:
         return ["Nothing: what is stored fits, or which parameters belong to this compass is not known."]
     return [_DO[state]] if state in _DO else []
 
