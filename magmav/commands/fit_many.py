@@ -20,13 +20,14 @@ from magmav.fitting.many import Run, Told, fit_many
 from magmav.reference import Reference
 from magmav.settings import Settings, SettingsError
 
-FOLDER, LEDGER = Path("magmav-fit"), "ledger.jsonl"
+FOLDER, LEDGER, LOGS = Path("magmav-fit"), "ledger.jsonl", "logs"
 INPUT = 3
 
 
 def wanted(o: argparse.Namespace) -> bool:
     """Is this a run over many logs?"""
-    return len(o.logs) > 1 or o.dask is not None or o.resume or any(path.is_dir() for path in o.logs)
+    asked = o.out is not None or o.dask is not None or o.resume
+    return asked or len(o.logs) > 1 or any(path.is_dir() for path in o.logs)
 
 
 def run_many(o: argparse.Namespace, settings: Settings, options: FitOptions) -> int:
@@ -34,7 +35,7 @@ def run_many(o: argparse.Namespace, settings: Settings, options: FitOptions) -> 
     from magmav.view.many import many_view
 
     if o.params is not None or o.report is not None:
-        raise SettingsError("--params, --report: one file is for one log; --out DIR gives several logs' results")
+        raise SettingsError("--params, --report: one file is for one log; --out DIR gives every log its own")
     if o.jobs is not None and o.jobs < 1:
         raise SettingsError(f"--jobs: want 1 or more, got {o.jobs}")
     if o.reference is not None:
@@ -48,6 +49,7 @@ def run_many(o: argparse.Namespace, settings: Settings, options: FitOptions) -> 
             run = fit_many(o.logs, settings, options, ledger, jobs=o.jobs, dask=o.dask, tell=watching)
         table = finite(run.table(ledger))
         files = write_tables(table, out)
+        write_logs(run.entries(ledger), out / LOGS)
         if o.store is not None:
             remember(o.store, run.entries(ledger))
         if o.json:
@@ -71,6 +73,24 @@ def write_tables(table: dict[str, Any], out: Path) -> list[Path]:
         os.replace(part, path)
         files.append(path)
     return files
+
+
+def write_logs(entries: Iterable[dict[str, Any]], folder: Path) -> None:
+    """A report of each log, and a parameter file of each vehicle in it that has something to change."""
+    from magmav.fitting.parameters import file_of
+    from magmav.view.many import report_name
+    from magmav.view.report import write_report, write_whole
+
+    folder.mkdir(exist_ok=True)
+    for entry in entries:
+        path = folder / report_name(entry["file"]["path"], entry["file"]["sha256"])
+        write_report(finite(entry), path)
+        for vehicle in entry["vehicles"]:
+            several = f"-system{vehicle['system']}" if len(entry["vehicles"]) > 1 else ""
+            fits = [compass["fit"] for compass in vehicle["compasses"] if compass["fit"] is not None]
+            if any(fit["parameters"]["changed"] for fit in fits):
+                text = file_of(entry | {"vehicles": [vehicle]}, ".param")
+                write_whole(path.with_name(f"{path.stem}{several}.param"), text)
 
 
 def remember(path: Path, entries: Iterable[dict[str, Any]]) -> None:

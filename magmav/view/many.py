@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import PurePath
 from typing import Any
 
 from rich import box
@@ -124,6 +125,12 @@ def many_html(table: Json) -> str:
     )
 
 
+def report_name(path: str, sha256: str) -> str:
+    """What the report of a log is called: its name as far as any file system and link takes it, and its content's."""
+    stem = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in PurePath(path).stem)[:60]
+    return f"{stem}-{sha256[:8]}.html"
+
+
 def _html_rows(compass: Json) -> str:
     head = "<th>date (UTC)</th><th class=w>log</th><th class=w>verdict</th>"
     head += "".join(f"<th>{axis} mG</th><th>sigma</th>" for axis in AXES)
@@ -132,7 +139,7 @@ def _html_rows(compass: Json) -> str:
     rows = []
     for row in compass["logs"]:
         offsets, sigma = row["new_offsets_mg"], row["sigma_mg"]
-        cells = [f"<td>{row['date'] or 'not known'}</td>", f"<td class=w>{escape(row['path'])}</td>"]
+        cells = [f"<td>{row['date'] or 'not known'}</td>", f"<td class=w>{_link(row)}</td>"]
         cells.append(f"<td class=w>{escape(row['state'])}</td>")
         for i in range(3):
             cells += [f"<td>{_number(values and values[i], 1)}</td>" for values in (offsets, sigma)]
@@ -140,6 +147,10 @@ def _html_rows(compass: Json) -> str:
         cells.append(f"<td class=w>{escape(row['heading_reference'] or '-')}</td>")
         rows.append(f"<tr{' class=changed' * (row['sha256'] in changed)}>{''.join(cells)}</tr>")
     return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+
+
+def _link(row: Json) -> str:
+    return f'<a href="logs/{report_name(row["path"], row["sha256"])}">{escape(row["path"])}</a>'
 
 
 def _picture(compass: Json) -> str:
