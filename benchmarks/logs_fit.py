@@ -44,7 +44,8 @@ path, mag, until_s, plot = sys.argv[1], sys.argv[2], float(sys.argv[3]), sys.arg
 whole = magfit.magfit
 def within(mlog, in_range, save_plot=None):
     first = mlog.recv_match(type=["ATT"])
-    start = first._timestamp - 1e-6 * first.TimeUS
+    start = first._timestamp - (1e-6 * first.TimeUS if hasattr(first, "TimeUS") else 1e-3 * first.TimeMS)
+    mlog.rewind()
     return whole(mlog, lambda t: 1 if t - start > until_s else 0, save_plot=save_plot)
 magfit.magfit = within
 sys.argv = ["magfit", path, "--mag", mag, "--save-plot", plot]
@@ -148,7 +149,7 @@ def magfit(path: Path, console: Console) -> int:
             columns = Columns.of(tape.heard)
             half = first_half(columns)
             split_s = float(columns.boot_s[half])
-            asked = [python, "-c", _MAGFIT, str(path), f"MAG[{compass - 1}]"]
+            asked = [python, "-c", _MAGFIT, str(path), source(path, compass)]
             theirs_s += spent([*asked, "1e12", str(folder / "a.png")]).cpu_s
             held = _NEW.search(spent([*asked, f"{split_s:.3f}", str(folder / "b.png")]).out)
             known = after_flight([h.sample for h in tape.heard[:half]])
@@ -168,6 +169,13 @@ def magfit(path: Path, console: Console) -> int:
         f"ratio {theirs_s / mine.cpu_s:.1f}"
     )
     return 0
+
+
+def source(path: Path, compass: int) -> str:
+    """What magfit calls a compass: older logs have messages MAG, MAG2 and MAG3."""
+    if "MAG2" not in open_recording(path).heard:
+        return f"MAG[{compass - 1}]"
+    return "MAG" if compass == 1 else f"MAG{compass}"
 
 
 def taped(path: Path) -> tuple[dict[tuple[int, int], Tape], dict[int, Reference]]:
