@@ -12,7 +12,7 @@ from magmav.commands.common import progress_bar, settings_of, show
 
 def fit(o: argparse.Namespace) -> int:
     """One log or many."""
-    from magmav.commands.fit_many import remember, run_many, wanted
+    from magmav.commands.fit_many import LOGS, remember, run_many, wanted, write_logs
     from magmav.fitting import FitOptions
     from magmav.fitting import fit as run
     from magmav.view.fit import fit_view
@@ -33,6 +33,8 @@ def fit(o: argparse.Namespace) -> int:
         write_parameters(entries[0], o.params)
     if o.report is not None:
         write_report(entries[0], o.report)
+    if o.out is not None:
+        write_logs(entries, o.out / LOGS)
     if o.store is not None:
         remember(o.store, entries)
     show(o, {"logs": entries}, fit_view)

@@ -26,8 +26,7 @@ INPUT = 3
 
 def wanted(o: argparse.Namespace) -> bool:
     """Is this a run over many logs?"""
-    asked = o.out is not None or o.dask is not None or o.resume
-    return asked or len(o.logs) > 1 or any(path.is_dir() for path in o.logs)
+    return len(o.logs) > 1 or o.dask is not None or o.resume or any(path.is_dir() for path in o.logs)
 
 
 def run_many(o: argparse.Namespace, settings: Settings, options: FitOptions) -> int:
@@ -81,7 +80,7 @@ def write_logs(entries: Iterable[dict[str, Any]], folder: Path) -> None:
     from magmav.view.many import report_name
     from magmav.view.report import write_report, write_whole
 
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for entry in entries:
         path = folder / report_name(entry["file"]["path"], entry["file"]["sha256"])
         write_report(finite(entry), path)
