@@ -12,11 +12,15 @@ from html.parser import HTMLParser
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from magmav_sim import Simulation, load_scenario
+from magmav_sim.recorder import Recorder, unattended
 from report_entry import compass, entry
 
+from magmav.cli import main
 from magmav.view.records import ViewError
 from magmav.view.report import report_html, write_report
 from magmav.view.report_page import CSS
@@ -351,3 +355,19 @@ def test_a_compass_that_is_not_ready_never_says_write():
     text = " ".join(Seen(shown(report_html(learning))).text)
     assert text.count("do not write") == 2 and "Do not store these offsets." in text
     assert re.search(r"\bwrite\b", text.replace("do not write", "")) is None
+
+
+def test_AT_4a_the_command_writes_page_and_json_of_the_same_fit(tmp_path, capsys):
+    """Of a simulated flight, turned round into a page: nothing in it is lost, and a wrong name is refused at once."""
+    plan = unattended(load_scenario("figure8"))
+    plan = msgspec.structs.replace(plan, compasses=[plan.compasses[0]])
+    sim, log, page = Simulation(plan), tmp_path / "figure8.bin", tmp_path / "page.html"
+    with Recorder(sim, [log]):
+        sim.advance(60.0)
+    assert main(["fit", str(log), "--json", "--report", str(page)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    text = "".join(Seen(page.read_text(encoding="utf-8")).text)
+    assert json.loads(text[text.index('{"source"') :]) == document["logs"][0]
+    before = log.read_bytes()
+    assert main(["fit", str(log), "--report", str(log)]) == 3
+    assert log.read_bytes() == before
