@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magmav.comparison import Columns, Tape, first_half
 from magmav.core.after_flight import AfterFlight, after_flight
 from magmav.core.correction import field_of, iron_of_offsets
+from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.field import ExpectedField
 from magmav.core.types import Estimate, Sample, Vec3
 from magmav.fitting import cut
@@ -118,8 +119,14 @@ def solve(compass: int, tape: Tape, told: Told) -> Case | None:
 
 
 def _run(columns: Columns, samples: Sequence[Sample], half: int) -> AfterFlight | None:
-    until = samples[min(half, len(samples)) - 1].boot_ns if half else None
-    return after_flight(samples, until_ns=until)
+    """Both passes; and what a flight that ended in the middle of what taught would have told, at its own throttle."""
+    known = after_flight(samples)
+    if known is None:
+        return None
+    first = AdaptiveEstimator(second=False)
+    for s in samples[:half]:
+        first.step(s)
+    return replace(known, foretold=first.estimate(columns.expected))
 
 
 def _taught(samples: Sequence[Sample], keep: Flags) -> list[Sample]:
