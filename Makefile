@@ -30,6 +30,7 @@ test: $(VENV)/.ready
 
 # Hours on two cores; each takes how much as its first argument, and tells what it has when it is cut short.
 soak: $(VENV)/.ready
+	$(BIN)/pytest -n 2 -m long
 	$(BIN)/pytest -n 2 -m hypothesis --hypothesis-profile=searching
 	$(BIN)/python benchmarks/soak.py
 	$(BIN)/python benchmarks/soak_upload.py

@@ -155,17 +155,20 @@ def pooled(errors, sigmas, limit_mg=10.0):
     return math.sqrt(np.mean((errors[seen] / sigmas[seen]) ** 2))
 
 
+@pytest.mark.long
 def test_pooled_error_over_sigma_by_motion_alone(flights):
     """Tilt that wanders by 0.5 degrees over 12 s, 4 mG of noise, whole milligauss: 40 flights of three kinds."""
     errors = [e.hard_iron_b_mg - HARD_IRON_MG for _, e, _ in flights]
     assert 0.7 < pooled(errors, [e.own_sigma_mg for _, e, _ in flights]) < 1.2
 
 
+@pytest.mark.long
 def test_pooled_error_over_sigma_with_the_field_model(flights):
     errors = [e.hard_iron_b_mg - HARD_IRON_MG for *_, e in flights]
     assert 0.7 < pooled(errors, [np.sqrt(np.diag(e.covariance_mg2)) for *_, e in flights]) < 1.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_no_motion_is_far_from_its_claims_on_any_axis(flights, motion):
     ratios = [(e.hard_iron_b_mg - HARD_IRON_MG) / e.own_sigma_mg for kind, e, _ in flights if kind == motion]
@@ -174,12 +177,14 @@ def test_no_motion_is_far_from_its_claims_on_any_axis(flights, motion):
     assert rms.max() < 1.6
 
 
+@pytest.mark.long
 def test_published_sigmas_are_floored_and_stay_on_the_safe_side(flights):
     """Floors of 1.5, 1.5 and 5 mG come on top, so that the pooled ratio lies lower: never over-confident."""
     errors = [e.hard_iron_b_mg - HARD_IRON_MG for *_, e in flights]
     assert 0.5 < pooled(errors, [floored(e) for *_, e in flights]) < 1.0
 
 
+@pytest.mark.long
 def test_published_sigmas_hold_for_the_worse_tilt_of_a_real_autopilot():
     """0.7 degrees, what the heading's sigma reckons with too."""
     errors, sigmas = [], []

@@ -84,7 +84,7 @@ def test_one_spike_decides_it_for_ever():
 
 
 @pytest.mark.parametrize("method", ["minmax", "sytnyk"])
-@pytest.mark.parametrize("noise", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize("noise", [pytest.param(0.5, marks=pytest.mark.long), 2.0, 5.0])
 def test_extremes_that_were_never_met_are_refused_or_called_weak(method, noise):
     """Vehicles that stood at a few headings: the error is r (1 - cos(half the gap)) / 2, whatever the residual."""
     for seed in range(10):

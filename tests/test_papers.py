@@ -35,6 +35,7 @@ def between(page, name):
 # ---------------------------------------------------------------- the page
 
 
+@pytest.mark.long
 def test_the_page_shows_what_the_command_prints():
     done = subprocess.run([sys.executable, str(SCRIPT), "--markdown"], capture_output=True, text=True, check=True)
     assert between(PAGE.read_text(encoding="utf-8"), "papers") == done.stdout.strip()

@@ -35,20 +35,22 @@ pattern = [
 """
 
 
-@pytest.fixture
-def flown(tmp_path):
-    """Flies one to its end; returns it with the true heading over time."""
-    made = []
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Flies one to its end, once; returns it with the true heading over time."""
+    made = {}
 
-    def fly(simulation):
-        f = Flight(simulation, tmp_path)
-        made.append(f)
+    def fly(simulation, name=None):
+        if name in made:
+            return made[name]
+        f = Flight(simulation, tmp_path_factory.mktemp("flown"))
+        made[name or len(made)] = f
         f.true = []
         f.fly(lambda: f.true.append((f.sim.elapsed_ns, f.sim.truth.heading_rad)))
         return f
 
     yield fly
-    for f in made:
+    for f in made.values():
         f.end()
 
 
@@ -77,7 +79,7 @@ def test_three_compasses_on_different_mounts_are_each_right(flown):
 @pytest.mark.parametrize("yaw", ["compass", "truth"])
 def test_published_heading_is_true_whatever_the_autopilot_believes(flown, yaw):
     """The autopilot's own yaw is 70 degrees out while it follows the bad compass: it must not be learnt from."""
-    f = flown(vehicle(yaw=yaw))
+    f = flown(vehicle(yaw=yaw), yaw)
     off, sigma = heading_errors(f)
     late = slice(len(off) // 3, None)
     assert np.degrees(np.sqrt(np.mean(off[late] ** 2))) < 3.0
@@ -108,7 +110,7 @@ def test_what_the_autopilot_corrects_already_is_undone_exactly(flown):
 
 def test_uncorrected_heading_is_as_wrong_as_its_iron(flown):
     """The reference of every before-and-after figure: the stream as it is, against the truth."""
-    f = flown(vehicle())
+    f = flown(vehicle(), "compass")
     mine = [r for r in f.records if r.stored_heading.true_valid]
     times, true = (np.array(v, dtype=float) for v in zip(*f.true, strict=True))
     truth = np.interp([float(r.t_ns) for r in mine], times, np.unwrap(true))
