@@ -35,7 +35,7 @@ from rich.table import Table
 from magmav.core.types import Reading, Record, State
 from magmav.fleet import serve
 from magmav.link import Packet
-from magmav.settings import Settings
+from magmav.settings import Settings, with_value
 from magmav.store import Store
 
 HZ = 10
@@ -133,7 +133,8 @@ def measure(vehicles: int, seconds: float) -> Cost:
             seen += 1
 
     with TemporaryDirectory() as folder, Store(Path(folder) / "fleet.sqlite") as store:
-        service = serve(link, Settings(), earth_model, store, [watch])
+        room = with_value(Settings(), "wire", "budget_bps", 500.0 * vehicles)  # as each would have alone
+        service = serve(link, room, earth_model, store, [watch])
         from_ns = 5 * 10**9 + 6 * 10**9  # the flights; before that everybody says hello
         took_ns, arrived_ns = [], []
         for at_ns, data, route in track(every, f"{vehicles} vehicles", console=Console(stderr=True)):
