@@ -1,6 +1,6 @@
 # Two commands set everything up on a machine with Python 3.11 and nothing else:
 #   make demo   fly, learn, land, upload, fly again, on a simulated aircraft over real UDP
-#   make test   ruff, mypy --strict and every test
+#   make test   ruff, mypy --strict and every test but those marked long, which `make soak` runs
 # Both make their own environment in .venv; nothing touches the system Python.
 
 PYTHON ?= python3
@@ -16,7 +16,7 @@ $(VENV)/.ready: pyproject.toml uv.lock
 	  { rm -rf $(VENV); echo "python3-venv is missing: installing it" >&2; \
 	    apt-get update -qq && apt-get install -y -qq python3-venv && $(PYTHON) -m venv $(VENV); }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-	@$(BIN)/uv sync --quiet --frozen --inexact --compile-bytecode
+	@$(BIN)/uv sync --quiet --frozen --inexact
 	@touch $@
 
 demo: $(VENV)/.ready

@@ -240,6 +240,7 @@ def test_AT_16b_the_file_and_what_stays_reproduce_the_predicted_field(bent, opti
     assert entry["fit"]["parameters"]["closure_mg"] == pytest.approx(off[columns["taught"]].max(), abs=1e-3)
 
 
+@pytest.mark.long
 def test_soft_iron_that_was_asked_for_is_found_and_makes_the_field_round(bent):
     spec = load_scenario("soft_iron").compasses[0]
     (path, _) = bent
@@ -287,6 +288,7 @@ def test_AT_4a_the_document_holds_what_a_report_must(three):
     json.dumps(result, allow_nan=False)
 
 
+@pytest.mark.long
 def test_the_same_log_gives_the_same_document(eights, three):
     assert magmav.fit(eights[1]) == three["bin"]
 

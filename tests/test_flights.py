@@ -133,6 +133,7 @@ def test_copter_figure_eight_does_not_mix_what_was_changed_with_what_is():
     assert result["vehicles"][0]["compasses"][0]["heading"]["rms_deg"] < 3.0
 
 
+@pytest.mark.long
 def test_plane_circles_the_same_on_a_plane():
     result = check_compass_1("sitl/plane-circles.tlog")
     assert result["vehicles"][0]["compasses"][0]["heading"]["rms_deg"] < 5.0

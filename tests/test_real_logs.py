@@ -66,6 +66,7 @@ def test_a_px4_flight_comes_back_to_what_px4_had_stored():
     assert Reason.RELATIVE_ONLY.name not in [r["code"] for r in compass["reasons"]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["log171.bin", "esc_status_log.ulg"])
 def test_every_estimator_can_be_compared_on_it(name, capsys):
     words = ["compare", str(_DATA / name), "--only", "kalman,bullock,minmax_level", "--json"]

@@ -143,6 +143,7 @@ def test_throttle_is_drawn_where_the_current_is_not_known():
     assert shown(report_html(louder)) != shown(report_html(document))
 
 
+@pytest.mark.long
 def test_what_is_not_known_is_said_and_never_drawn_as_a_number():
     """Any one value, and any one whole part of a fit, may be null."""
     document = single()

@@ -51,6 +51,7 @@ def test_wheel_holds_code_and_configuration_and_nothing_else(wheel):
     assert not [n for n in names if n.endswith((".csv", ".tlog", ".pyc", ".sqlite"))]
 
 
+@pytest.mark.long
 def test_demo_runs_from_the_wheel_without_the_checkout(wheel, tmp_path):
     target, elsewhere, scratch = (tmp_path / n for n in ("target", "elsewhere", "scratch"))
     elsewhere.mkdir()

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.peers
 _ENOUGH_S = 120.0
 
 
+@pytest.mark.long
 def test_the_report_fits_a_phone_and_paper_and_asks_for_nothing(tmp_path):
     python = peer("page-playwright")
     page, pdf = tmp_path / "report.html", tmp_path / "report.pdf"
