@@ -296,7 +296,7 @@ def test_a_strange_field_that_was_ordinary_iron_is_withdrawn_and_a_magnets_is_ke
 
 def test_AT_3d_every_cause_has_a_stable_code_a_sentence_and_stands_in_the_page():
     root = Path(__file__).parents[1]
-    source = (root / "magmav" / "core" / "causes.py").read_text()
+    source = "".join((root / "magmav" / name).read_text() for name in ("core/causes.py", "fitting/why.py"))
     made = set(re.findall(r'"([A-Z]+_[A-Z_]+)"', source))
     page = (root / "docs" / "causes.md").read_text()
     assert made == set(re.findall(r"^\| `([A-Z_]+)` \|", page, flags=re.M))
