@@ -26,7 +26,7 @@ test: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 3
 
 # Hours on two cores; each takes how much as its first argument, and tells what it has when it is cut short.
 soak: $(VENV)/.ready

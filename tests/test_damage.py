@@ -289,6 +289,7 @@ def test_iron_under_the_pad_is_not_learnt(flight):
     assert ready(f.last()) and within_claim(f)
 
 
+@pytest.mark.long
 def test_motor_current_is_answered_at_mean_power(flight):
     """Offsets alone cannot follow current: right for the mean current of the flight, or not READY."""
     f = flight(scenario("motor"))

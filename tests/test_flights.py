@@ -46,6 +46,7 @@ def codes(compass):
     return {r["code"] for r in compass["reasons"]}
 
 
+@pytest.mark.long
 def test_thor_frozen_after_a_minute_keeps_its_heading_and_repeats_byte_for_byte():
     here = in_process("flights/thor75.tlog", learn_for_s=60.0)
     code, text = command_line("replay", _DATA / "flights/thor75.tlog", "--learn-for", 60, "--json")
@@ -128,6 +129,7 @@ def check_compass_1(name):
     return result
 
 
+@pytest.mark.long
 def test_copter_figure_eight_does_not_mix_what_was_changed_with_what_is():
     result = check_compass_1("sitl/copter-fig8.tlog")
     assert result["vehicles"][0]["compasses"][0]["heading"]["rms_deg"] < 3.0

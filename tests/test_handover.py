@@ -57,6 +57,7 @@ def iron(records):
     return np.array([r.estimate.hard_iron_b_mg for r in records])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("estimator", ["kalman", "adaptive"])
 def test_the_same_flight_with_and_without_new_offsets_is_the_same_to_the_last_bit(estimator):
     """But for a second that teaches nothing: so the twin is paused for it as well."""
@@ -79,6 +80,7 @@ def test_through_a_stored_matrix_the_same_to_rounding():
     assert [r.verdict.state for r in moved] == [r.verdict.state for r in plain]
 
 
+@pytest.mark.long
 def test_a_second_not_taught_is_all_that_it_costs():
     """Against the flight that nobody touched: 24 samples fewer, an answer within half a sigma, READY throughout."""
     plain, moved = played(), played(moved_mg=MOVED_MG)

@@ -363,6 +363,7 @@ def test_lost_attitude_hands_its_tilt_over(own):
 _DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared" / "data")) / "flights"
 
 
+@pytest.mark.long
 @pytest.mark.flights
 @pytest.mark.skipif(not _DATA.is_dir(), reason="no real recordings: set MAGMAV_DATA")
 @pytest.mark.parametrize(("name", "heading_deg"), [("broad02", 9.0), ("broad32", 4.0)])

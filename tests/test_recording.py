@@ -67,6 +67,7 @@ def without(recorded, *numbers):
     return bytes(kept)
 
 
+@pytest.mark.long
 def test_replay_knows_what_live_knew(recorded):
     result, records = again(recorded)
     assert len(records) == recorded.samples
@@ -89,6 +90,7 @@ def test_result_has_the_keys_that_others_rely_on(recorded):
     assert set(compass["heading"]) >= _HEADING_KEYS and set(compass["heading_offsets_only"]) >= _HEADING_KEYS
 
 
+@pytest.mark.long
 def test_freezing_stops_learning_at_that_second_after_take_off(recorded):
     whole, _ = again(recorded)
     result, records = again(recorded, learn_for_s=20.0)

@@ -196,6 +196,7 @@ def test_landed_means_landed():
     assert [s for i, s in enumerate(states) if i == 0 or states[i - 1] != s] == [1, 3, 2, 4, 1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["short", "c172x", "s_turns"])
 def test_gyro_and_attitude_agree_through_take_off_flight_and_landing(name):
     """Body rates carried through half a second give the attitude change, launches and touch-down included."""

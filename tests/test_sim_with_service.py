@@ -67,6 +67,7 @@ def heading_errors(f, compass=1):
     return off, np.array([r.heading.sigma_rad for r in mine])
 
 
+@pytest.mark.long
 def test_three_compasses_on_different_mounts_are_each_right(flown):
     f = flown(scenario("three_compasses"))
     for compass, device in ((1, 97539), (2, 131874), (3, 263178)):
@@ -87,6 +88,7 @@ def test_published_heading_is_true_whatever_the_autopilot_believes(flown, yaw):
     assert ready(f.last()) and (np.abs(error_mg(f.sim, f.last())) <= 3.5 * f.last().sigma_mg).all()
 
 
+@pytest.mark.long
 def test_southern_hemisphere_has_the_field_pointing_up_and_the_same_answer(flown):
     f = flown(vehicle(lat="-33.9"))
     record = f.last()

@@ -15,6 +15,7 @@ from magmav.core.types import AxisState, Reason, Shaping, State, mat3, vec3
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings, with_value
 
+pytestmark = pytest.mark.long  # whole flights; test_two_axis.py holds the method
 TWO = with_value(Settings(), "compass", "axes", 2)
 
 
