@@ -119,6 +119,7 @@ def test_AT_4a_the_page_holds_the_whole_json():
     assert json.loads(text[text.index('{"source"') :]) == entry()
 
 
+@pytest.mark.long
 def test_AT_4a_whatever_value_of_a_fit_changes_the_readable_part_of_the_page_changes():
     """Old and new values, held-out errors, deviation, data source, time span, version: nothing is left out."""
     document = single()
@@ -358,6 +359,7 @@ def test_a_compass_that_is_not_ready_never_says_write():
     assert re.search(r"\bwrite\b", text.replace("do not write", "")) is None
 
 
+@pytest.mark.long
 def test_AT_4a_the_command_writes_page_and_json_of_the_same_fit(tmp_path, capsys):
     """Of a simulated flight, turned round into a page: nothing in it is lost, and a wrong name is refused at once."""
     plan = unattended(load_scenario("figure8"))
