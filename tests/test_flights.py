@@ -65,6 +65,7 @@ def test_thor_frozen_after_a_minute_keeps_its_heading_and_repeats_byte_for_byte(
     assert compass["device_id"] == 97539 and not compass["relative"]
 
 
+@pytest.mark.long
 def test_thor_half_a_minute_is_enough_for_what_it_claims():
     (compass,) = in_process("flights/thor75.tlog", learn_for_s=30.0)["vehicles"][0]["compasses"]
     assert compass["heading"]["rms_deg"] <= 5.0

@@ -29,6 +29,8 @@ FILES = ("fits.json", "fits.csv", "fits.html")
 KEY = work_key(Settings(), FitOptions())
 WALL_S = 300.0
 
+pytestmark = pytest.mark.long  # until a fit is fast
+
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -83,6 +83,7 @@ def test_one_spike_decides_it_for_ever():
     assert isinstance(fitted("bullock", np.vstack(([300.0, 0.0], points))), Fit)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["minmax", "sytnyk"])
 @pytest.mark.parametrize("noise", [pytest.param(0.5, marks=pytest.mark.long), 2.0, 5.0])
 def test_extremes_that_were_never_met_are_refused_or_called_weak(method, noise):
