@@ -7,6 +7,7 @@ import socket
 
 import pytest
 from process_rig import magmav
+from tlog_parity import flight
 
 from magmav.cli import main, parser
 
@@ -64,6 +65,26 @@ def test_values_out_of_range_are_exit_2(told, tmp_path, words, culprit):
     code, result = told("replay", tmp_path / "x.tlog", "--json", *words)
     assert code == 2
     assert culprit in result["error"]["text"]
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name", "wants"),
+    [
+        ("fit", "--report", "hill.bin", "reports want a name ending in .html"),
+        ("fit", "--report", "report", "reports want a name ending in .html"),
+        ("replay", "--plot", "hill.jpg", "pictures want a name ending in .png"),
+        ("compare", "--plot", "hill.pdf", "pictures want a name ending in .png"),
+        ("replay", "--records", "hill.txt", "records want a name ending in .jsonl, .json or .csv"),
+    ],
+)
+def test_a_file_name_of_the_wrong_kind_is_exit_2_says_what_is_wanted_and_touches_nothing(
+    told, tmp_path, command, option, name, wants
+):
+    (log := tmp_path / "x.tlog").write_bytes(b"".join(flight(1)))
+    (out := tmp_path / name).write_bytes(b"mine")
+    code, result = told(command, log, "--json", option, out)
+    assert code == 2 and result["error"] == {"code": 2, "text": f"{out}: {wants}"}
+    assert out.read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(

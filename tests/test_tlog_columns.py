@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tlog_parity import HARM, Harm, cut, flight, flip, one_by_one, values_of, woven
+from tlog_parity import HARM, Harm, cut, flight, flip, harmed, one_by_one, values_of, woven
 
 from magmav.link import LinkError
 from magmav.logs.tlog import columns, read_tlog
@@ -71,11 +71,7 @@ def test_fields_are_those_of_the_dialect_number_for_number() -> None:
 @given(seed=st.integers(0, 2**32 - 1), harm=st.lists(st.sampled_from(HARM), min_size=1, max_size=6))
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_same_as_one_by_one_however_damaged(tmp_path: Path, seed: int, harm: list[Harm]) -> None:
-    data, rng = bytearray(b"".join(flight(seed % 50, 60))), random.Random(seed)
-    for one in harm:
-        if len(data) > 1:
-            one(data, rng)
-    path = tmp_path / "a.tlog"
+    path, data = tmp_path / "a.tlog", harmed(seed, harm)
     path.write_bytes(data)
     try:
         one_by_one(path, WANTED)
@@ -84,7 +80,7 @@ def test_same_as_one_by_one_however_damaged(tmp_path: Path, seed: int, harm: lis
             read_tlog(path, WANTED)
         assert str(mine.value) == str(error)
         return
-    same(path, bytes(data))
+    same(path, data)
 
 
 def test_same_as_one_by_one_where_the_recorder_clock_was_set(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from tlog_parity import HARM, START_US, Harm, cut, flight, flip
+from tlog_parity import HARM, START_US, Harm, cut, flight, flip, harmed
 
 from magmav.core.types import MagReading, Reading
 from magmav.hearing import LinkRecording
@@ -56,12 +56,8 @@ def test_same_readings_and_counts_of_several_vehicles(tmp_path: Path, seed: int)
 @given(seed=st.integers(0, 2**32 - 1), harm=st.lists(st.sampled_from(HARM), min_size=1, max_size=5))
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_same_readings_however_damaged(tmp_path: Path, seed: int, harm: list[Harm]) -> None:
-    data, rng = bytearray(b"".join(flight(seed % 40, 60))), random.Random(seed)
-    for one in harm:
-        if len(data) > 1:
-            one(data, rng)
     path = tmp_path / "a.tlog"
-    path.write_bytes(data)
+    path.write_bytes(harmed(seed, harm))
     try:
         TlogLink(path).close()
     except LinkError:

@@ -89,6 +89,15 @@ def repeat(data: bytearray, rng: random.Random) -> None:
 HARM: list[Harm] = [flip, cut, lose, stuff, lie, repeat]
 
 
+def harmed(seed: int, harm: list[Harm]) -> bytes:
+    """A short flight with these harms done to it one after the other."""
+    data, rng = bytearray(b"".join(flight(seed % 50, 60))), random.Random(seed)
+    for one in harm:
+        if len(data) > 1:
+            one(data, rng)
+    return bytes(data)
+
+
 def one_by_one(path: Path, wanted: frozenset[str]) -> tuple[list[Row], Counter[str], Counter[str]]:
     """(name, t_ns, system, component, whole payload) of each message in turn; the link's and the codec's counts."""
     link, codec = TlogLink(path), Codec(wanted)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magmav.view.records import ViewError
+from magmav.view.records import ViewError, WrongName
 from magmav.view.trace import Floats
 
 if TYPE_CHECKING:
@@ -98,6 +98,6 @@ def save(figure: Figure, path_png: str | Path) -> None:
 
 
 def check_name(path_png: str | Path) -> None:
-    """ViewError for a name that is not a PNG's, before anything is drawn."""
+    """WrongName for a name that is not a PNG's, before anything is drawn."""
     if Path(path_png).suffix.lower() != ".png":
-        raise ViewError(f"{path_png}: pictures want a name ending in .png")
+        raise WrongName(f"{path_png}: pictures want a name ending in .png")

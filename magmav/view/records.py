@@ -31,6 +31,10 @@ class ViewError(Exception):
     """Something a view cannot read or write; the text names the file and what is wrong."""
 
 
+class WrongName(ViewError, ValueError):
+    """A file name asked for that is not of the kind that is written; nothing was read or written. A wrong argument."""
+
+
 class Column(NamedTuple):
     """One column: its name, how its text is read back, and what it means."""
 
@@ -224,7 +228,7 @@ def _text(value: Value) -> str:
 
 def _is_csv(path: Path) -> bool:
     if path.suffix.lower() not in (".csv", ".jsonl", ".json"):
-        raise ViewError(f"{path}: records want a name ending in .jsonl, .json or .csv")
+        raise WrongName(f"{path}: records want a name ending in .jsonl, .json or .csv")
     return path.suffix.lower() == ".csv"
 
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from magmav.view.records import ViewError
+from magmav.view.records import ViewError, WrongName
 from magmav.view.report_compass import compass_section
 from magmav.view.report_page import Child, Markup, facts, number, page, table, tag, word
 from magmav.view.report_words import autopilot_name, title_of
@@ -44,9 +44,9 @@ def write_report(entry: Json, path: str | Path) -> None:
 
 
 def check_report_name(path: str | Path) -> None:
-    """ViewError for a name that is not a page's: the likeliest mistake is naming a log here."""
+    """WrongName for a name that is not a page's: the likeliest mistake is naming a log here."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise ViewError(f"{path}: reports want a name ending in .html")
+        raise WrongName(f"{path}: reports want a name ending in .html")
 
 
 def write_whole(path: Path, content: str) -> None:
