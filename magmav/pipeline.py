@@ -18,12 +18,20 @@ from magmav.vehicle import Tap, Vehicle
 class Pipeline:
     """Every vehicle on a link. ``unix_offset_ns`` takes arrival time to UNIX time, for the field model's date.
 
-    tap : sees every Sample before it is learnt from, see vehicle.Tap.
+    tap : sees every Sample before it is learnt from, see vehicle.Tap.  learns : False where that is all.
     """
 
-    def __init__(self, settings: Settings, model: FieldModel, unix_offset_ns: int = 0, tap: Tap | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        model: FieldModel,
+        unix_offset_ns: int = 0,
+        tap: Tap | None = None,
+        learns: bool = True,
+    ) -> None:
         self.settings = settings
         self._tap = tap
+        self._learns = learns
         self._model = model
         self._unix_offset_ns = unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
@@ -51,5 +59,5 @@ class Pipeline:
         vehicle, system = self.vehicles.get(reading.system), reading.system
         if vehicle is None:
             settings = self._own.get(system, self.settings)
-            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap)
+            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap, self._learns)
         return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)

@@ -15,7 +15,7 @@ from magmav.core.assemble import Assembler
 from magmav.core.causes import Causes
 from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.correction import without_third
-from magmav.core.estimators import ESTIMATORS, Estimator
+from magmav.core.estimators import ESTIMATORS, Estimator, Idle
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
@@ -78,11 +78,17 @@ class Boot:
 
 
 class Vehicle:
-    """One vehicle: what it says of itself, and one channel per compass."""
+    """One vehicle: what it says of itself, and one channel per compass.
 
-    def __init__(self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None) -> None:
+    learns : False where only the Samples are wanted, which ``tap`` sees.
+    """
+
+    def __init__(
+        self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None, learns: bool = True
+    ) -> None:
         self.system = system
         self._tap = tap
+        self._learns = learns
         self.settings = settings
         self.autopilot = 0
         self.learning = settings.learn.on
@@ -211,7 +217,8 @@ class Vehicle:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
-        self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
+        if self._learns:
+            self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
         finding = self._doubted(finding, held.refuses(compass) or self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
@@ -319,7 +326,7 @@ class Vehicle:
 
     def _channel(self, compass: int) -> Channel:
         if compass not in self.channels:
-            self.channels[compass] = new_channel(self.settings)
+            self.channels[compass] = new_channel(self.settings, make=None if self._learns else Idle)
         return self.channels[compass]
 
     def settle(self, compass: int) -> None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import copy
 import math
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -30,7 +31,6 @@ from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import equation
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import Tuning
 from magmav.core.rotation import TAU, body_from_earth
@@ -38,6 +38,7 @@ from magmav.core.two_filter import noted, product
 from magmav.core.types import Estimate, Sample, mat3
 
 _EVERY_NS = 1_000_000_000
+_MOMENTS = 600  # at most about so many: between them the iron is a straight line
 _LATE_NS = 5_000_000_000  # a change is noticed within so long
 _CLEAR = 25.0  # chi squared of three axes beyond which the two irons are two: once in 60 000
 _SURE_RAD = math.radians(20.0)  # then the side that begins at the end looks for north on that side only
@@ -48,14 +49,14 @@ _LEAST_MG, _SHARE = 80.0, 1.5  # the iron is let go by at least so much, and so 
 class AfterFlight:
     """What is known of the iron of every moment with the whole flight known.
 
-    boot_ns : (N,) increasing, about a second apart.  estimates : N of them; their hard iron is at the same throttle as
-    the estimator's own.  changes_ns : the iron changed suddenly right after these.
+    boot_ns : (N,) increasing, a second apart, or a 600th of the flight.  estimates : N of them; their hard
+    iron is at the same throttle as the estimator's own.  changes_ns : the iron changed suddenly right after these.
     """
 
     boot_ns: NDArray[np.int64]
     estimates: tuple[Estimate, ...]
     changes_ns: tuple[int, ...]
-    foretold: Estimate | None = None  # what was believed at the time asked for, with nothing of what came after
+    foretold: Estimate | None = None  # by the time asked for, with nothing of what came after
 
     @property
     def answer(self) -> Estimate:
@@ -93,10 +94,8 @@ def after_flight(
     flown = _framed(_flown(samples))
     if not flown:
         return None
-    run = _BothWays(flown, tuning)
-    then = max((t for t in run.before if until_ns is not None and t <= until_ns), default=None)
-    foretold = None if then is None else run.forward.says(run.before[then])
-    changes = run.changes()
+    run = _BothWays(flown, tuning, until_ns=until_ns)
+    foretold, changes = run.foretold, run.changes()
     if changes or run.startled:
         run = _BothWays(flown, tuning, changes, run.middle_ns)
     known = [(t, e) for t, e in run.estimates() if e is not None]
@@ -205,15 +204,14 @@ class _Pass(AdaptiveEstimator):
         super()._learn()
 
     def _update(self, bank: Bank, block: Block) -> None:
-        best = int(np.argmax(bank.log_weight))
-        foretold = equation(bank.x[best : best + 1], block)[0]
-        squares = ((block.z - foretold[0])[:, : block.axes] ** 2).sum(1)
-        self.seen |= zip(self._times_ns, squares.tolist(), strict=True)
         before_s = self._change.since_s
         self._change.deaf = self._deaf[0] <= self.ends_ns[0] <= self._deaf[1]
         super()._update(bank, block)
         if self._change.since_s < before_s:
             self.changed.append(self.ends_ns)
+
+    def _met(self, nu: Array) -> None:
+        self.seen |= zip(self._times_ns, (nu * nu).sum(1).tolist(), strict=True)
 
     @property
     def bank(self) -> Bank | None:
@@ -259,7 +257,7 @@ class _BothWays:
     """A flight run forwards, then backwards over the same blocks.
 
     told : the iron changes right after these, by so many mG.  elder_ns : before it the forward side, after it the
-    backward side notices nothing by itself; None: both do always.
+    backward side notices nothing by itself; None: both do always.  until_ns : boot time of ``foretold``.
     """
 
     def __init__(
@@ -268,7 +266,10 @@ class _BothWays:
         tuning: Tuning | None,
         told: Mapping[int, float] | None = None,
         elder_ns: float | None = None,
+        until_ns: int | None = None,
     ) -> None:
+        self._until_ns = until_ns
+        self.foretold: Estimate | None = None
         self._told = sorted((told or {}).items())
         self.forward = _Pass(tuning, (-math.inf, -math.inf if elder_ns is None else elder_ns))
         self.before: dict[int, Bank] = {}
@@ -289,6 +290,8 @@ class _BothWays:
                 self._note()
                 one.let_go(told.pop(0)[1])
                 due_ns = 0
+            if self._until_ns is not None and s.boot_ns > self._until_ns:
+                self.foretold, self._until_ns = one.estimate(None), None
             blocks = len(one.seen)  # grows with each block
             one.step(s)
             if len(one.seen) > blocks and one.ends_ns[1] >= due_ns:
@@ -329,12 +332,22 @@ class _BothWays:
         """Of each moment in turn, with all of the flight."""
         one, n = self.forward, self.forward.tuning
         begun = Bank.begun(self.backward.field, n) if self.after else None
-        for at_ns, before in sorted(self.before.items()):
-            bank = before
+        for at_ns in self._moments():
+            bank = before = self.before[at_ns]
             if begun is not None and at_ns in self.after:
                 after, heading = self.after[at_ns]
                 bank = product(before, after, begun, n.temper, heading)
             yield at_ns, one.says(bank)
+
+    def _moments(self) -> list[int]:
+        """Of those noted some hundred, evenly; and those next to a change."""
+        times = sorted(self.before)
+        every = 1 + len(times) // _MOMENTS
+        wanted = {*times[::every], *times[-1:]}
+        for at_ns, _ in self._told:
+            after = bisect_right(times, at_ns)
+            wanted |= {*times[max(after - 1, 0) : after + 1]}
+        return sorted(wanted)
 
     # ------------------------------------------------------------ sudden changes
 

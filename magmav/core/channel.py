@@ -19,7 +19,7 @@ from magmav.core.correction import (
     stored_heading,
     turned_on,
 )
-from magmav.core.estimators import Estimator
+from magmav.core.estimators import Estimator, Idle
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
@@ -151,6 +151,8 @@ class Channel:
             s = self._after_hold(s)
             self._estimator.step(s)
         belief = self._belief
+        if belief is not None and isinstance(self._estimator, Idle):
+            return belief
         if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
             belief = self._believe(s, c)
         return belief

@@ -10,8 +10,6 @@ weight, times the overlap of the two, tempered as the banks' own likelihoods are
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
@@ -33,9 +31,7 @@ def noted(bank: Bank) -> Bank:
     w = bank.weights()
     kept = w > _LEAST * w.max()
     kept[[max(np.flatnonzero(bank.model == m), key=lambda i: w[i]) for m in np.unique(bank.model)]] = True
-    out = copy.copy(bank)
-    out.keep(np.flatnonzero(kept))
-    return out
+    return bank.kept(np.flatnonzero(kept))
 
 
 def product(before: Bank, after: Bank, begun: Bank, temper: float, heading: bool = True) -> Bank:
@@ -50,7 +46,7 @@ def product(before: Bank, after: Bank, begun: Bank, temper: float, heading: bool
     ]
     x, p, log_weight, model = (np.concatenate(one) for one in zip(*parts, strict=True))
     likely = np.flatnonzero(log_weight > log_weight.max() + np.log(_LEAST))
-    out = copy.copy(before)
+    out = before.kept(np.arange(0))
     out.model, out.log_weight = model[likely], log_weight[likely] - log_weight.max()
     out.x, out.p = np.zeros((len(likely), at.SIZE)), np.zeros((len(likely), at.SIZE, at.SIZE))
     out.x[:, SHARED] = x[likely]

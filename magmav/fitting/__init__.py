@@ -22,12 +22,11 @@ from magmav.geomag import world_magnetic_model
 from magmav.logs import HEAD, Progress, kind_of
 from magmav.recording import open_recording, replay
 from magmav.reference import Reference
-from magmav.settings import Settings, with_value
+from magmav.settings import Settings
 from magmav.vehicle import Boot, Vehicle
 
 Result = dict[str, Any]
 _CHUNK = 1 << 20
-_QUICK = "minmax"  # while the recording is played; what counts is learnt from its Samples afterwards
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ def fit(
     try:
         result = replay(
             recording,
-            with_value(settings, "learn", "estimator", _QUICK),
+            settings,
             model,
             source=str(path),
             reference_csv=None if options.heading_reference is None else Path(options.heading_reference),
@@ -78,6 +77,7 @@ def fit(
             references=references,
             tap=recorder.tap,
             boots=boots,
+            learns=False,
         )
     finally:
         recording.close()

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from magmav.comparison import Columns, Tape, first_half
 from magmav.core.after_flight import AfterFlight, after_flight
 from magmav.core.correction import field_of, iron_of_offsets
-from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.field import ExpectedField
 from magmav.core.types import Estimate, Sample, Vec3
 from magmav.fitting import cut
@@ -104,7 +103,7 @@ def solve(compass: int, tape: Tape, told: Told) -> Case | None:
     keep, cuts = cut.before_the_fit(columns, told.boot.phase, by_hand & flown, settling)
     columns = replace(columns, learn=keep)
     samples, half = _taught(heard, keep), first_half(columns)
-    known = _run(columns, samples, half)
+    known = after_flight(samples, until_ns=samples[half - 1].boot_ns)
     if known is None:
         return None
     off = misfit(columns, _along(columns, known, samples), known.answer)
@@ -112,21 +111,10 @@ def solve(compass: int, tape: Tape, told: Told) -> Case | None:
     if more:
         columns, cuts = replace(columns, learn=later), cut.merged(cuts, more)
         samples, half = _taught(samples, later), first_half(columns)
-        known = _run(columns, samples, half) or known
+        known = after_flight(samples, until_ns=samples[half - 1].boot_ns) or known
     unknown = np.full(len(columns.boot_s), np.nan)
     ampere = unknown if told.currents is None else told.currents.at(columns.boot_s)
     return Case(compass, tape, told, columns, samples, cuts, known, half, ampere)
-
-
-def _run(columns: Columns, samples: Sequence[Sample], half: int) -> AfterFlight | None:
-    """Both passes; and what a flight that ended in the middle of what taught would have told, at its own throttle."""
-    known = after_flight(samples)
-    if known is None:
-        return None
-    first = AdaptiveEstimator(second=False)
-    for s in samples[:half]:
-        first.step(s)
-    return replace(known, foretold=first.estimate(columns.expected))
 
 
 def _taught(samples: Sequence[Sample], keep: Flags) -> list[Sample]:

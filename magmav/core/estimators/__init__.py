@@ -39,6 +39,17 @@ class Estimator(Protocol):
         ...
 
 
+class Idle:
+    """Learns nothing, at no cost: for who wants Samples alone, which do not depend on what is learnt from them."""
+
+    def step(self, sample: Sample) -> None:
+        """Nothing."""
+
+    def estimate(self, expected: ExpectedField | None) -> Estimate | None:
+        """Nothing."""
+        return None
+
+
 LEAST_SAMPLES = 20
 
 

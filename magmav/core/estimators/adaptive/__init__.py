@@ -213,6 +213,7 @@ class AdaptiveEstimator:
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
+        self._met(nu[int(np.argmax(bank.log_weight))])
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         pj = bank.p @ rows.transpose(0, 2, 1)
         expected = rows @ pj
@@ -253,6 +254,9 @@ class AdaptiveEstimator:
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
         self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
+
+    def _met(self, nu: Array) -> None:
+        """What the most believed hypothesis did not foretell of a block, (n, axes) mG."""
 
     def _open(self, bank: Bank, block: Block) -> None:
         """The iron has changed. What else is known stays; where that is not even the field, begin anew."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import replace
 from typing import Any
@@ -99,8 +98,7 @@ class Bank:
         rows = np.flatnonzero(self.model == FIRST)
         first, parts = MODELS[FIRST], []
         for m, one in enumerate(MODELS):
-            part = copy.copy(self)
-            part.keep(rows)
+            part = self.kept(rows)
             own, theirs = one.soft_variances(), first.soft_variances()
             if not np.array_equal(own, theirs):
                 part.log_weight += n.temper * part._told(own * theirs / (theirs - own), theirs / own)
@@ -203,6 +201,13 @@ class Bank:
     def share(self, model: Model) -> float:
         """How much one model is believed."""
         return float(self.weights()[self.model == MODELS.index(model)].sum())
+
+    def kept(self, rows: Index) -> Bank:
+        """A bank of these alone."""
+        out = Bank.__new__(Bank)
+        out.__dict__ |= self.__dict__
+        out.keep(rows)
+        return out
 
     def keep(self, rows: Index) -> None:
         """Only these, in this order."""
