@@ -147,6 +147,17 @@ def test_garbage_between_records_costs_no_record(tmp_path: Path, garbage: bytes)
     assert link.counts["garbage bytes"] == len(garbage) and link.counts["resync"] == 1
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_garbage_between_all_records_costs_no_record_and_no_time(tmp_path: Path, seed: int) -> None:
+    """A frame with garbage before and behind it has no company, and is the same frame."""
+    records, rng = flight(60), random.Random(seed)
+    parts = [part for r in records[2:] for part in (rng.randbytes(rng.randrange(1, 400)), r)]
+    packets, link = read(written(tmp_path / "a.tlog", *records[:2], *parts))
+    assert frames_of(packets) == [r[8:] for r in records]
+    assert [p.t_ns for p in packets if p.data] == [int.from_bytes(r[:8], "big") * 1000 for r in records]
+    assert link.counts["garbage bytes"] == sum(map(len, parts[::2])) and link.unix_offset_ns == 0
+
+
 def test_garbage_before_the_first_record_is_skipped(tmp_path: Path) -> None:
     records = flight(20)
     packets, _ = read(written(tmp_path / "a.tlog", b"\x00\x05" * 3000, *records))

@@ -10,14 +10,14 @@ from magmav.link.records import (
     HEAD,
     LONGEST_RECORD,
     RUN,
+    SECOND_US,
     STAMP,
     find_record,
     plausible,
     record_size,
 )
 
-_SECOND_US = 1_000_000
-_MINUTE_US = 60 * _SECOND_US
+_MINUTE_US = 60 * SECOND_US
 _TICKS = 5  # quiet ticks at most in one gap: enough for every timeout to be met, however long the gap
 # Bytes in sight that any decision below needs, except at the end of the file.
 AHEAD = 2 * RUN * LONGEST_RECORD
@@ -77,7 +77,7 @@ class RecordCutter:
                 size = length + 16
             else:
                 size = record_size(magic, length, flags)
-            if size == 0 or not 0 <= then_us - stamp_us <= _SECOND_US:
+            if size == 0 or not 0 <= then_us - stamp_us <= SECOND_US:
                 odd = True
                 break
             add(Packet(stamp_us * 1000 - offset_ns, data[at + STAMP : end], route))
@@ -96,15 +96,15 @@ class RecordCutter:
         data, end, now_us = self._data, self._end, self._stamp_us or 0
         after = end + size
         behind_us = HEAD.unpack_from(data, after)[0] if after + HEAD.size <= len(data) else None
-        returns = behind_us is not None and now_us - _SECOND_US <= behind_us and plausible(behind_us, now_us)
+        returns = behind_us is not None and now_us - SECOND_US <= behind_us and plausible(behind_us, now_us)
         if size == 0:
             self._break(out)
         elif plausible(then_us, now_us):
-            if then_us < now_us - _SECOND_US:  # set back, if the one behind says so too
+            if then_us < now_us - SECOND_US:  # set back, if the one behind says so too
                 off_us = _MINUTE_US if behind_us is None else abs(behind_us - then_us)
                 damaged = off_us >= min(_MINUTE_US, abs((behind_us or 0) - now_us))
             else:  # a silence, unless the one behind comes before
-                damaged = plausible(behind_us or 0, now_us) and (behind_us or 0) < then_us - _SECOND_US
+                damaged = plausible(behind_us or 0, now_us) and (behind_us or 0) < then_us - SECOND_US
             self._next(out, end, None if damaged else then_us)
         elif (returns and record_size(*data[after + STAMP : after + HEAD.size])) or (after == len(data) and self._last):
             self._next(out, end, None)
@@ -173,7 +173,7 @@ class RecordCutter:
         self._at, self._end = at, end
         if was_us is None:
             self._stamp_us = stamp_us
-        elif stamp_us is not None and not -_SECOND_US <= stamp_us - was_us < 0:
+        elif stamp_us is not None and not -SECOND_US <= stamp_us - was_us < 0:
             if stamp_us < was_us or not plausible(stamp_us, was_us):
                 self._counts["clock set"] += 1
                 self._unix_offset_ns += (stamp_us - was_us) * 1000
