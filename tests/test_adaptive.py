@@ -50,17 +50,25 @@ def states(seed, k=4):
     return x
 
 
+def readings_of(seed, n):
+    """n times (attitude, turn rate, throttle - 1/2): at any attitude, turning fast."""
+    rng = np.random.default_rng(200 + seed)
+    return [
+        (body_from_earth(*rng.uniform(-3, 3, 3)), rng.normal(0, 0.5, 3), float(rng.uniform(-0.5, 0.5)))
+        for _ in range(n)
+    ]
+
+
 def block_of(seed, n=3):
-    """n readings in a row at any attitude, turning fast, through a matrix that is not the identity."""
+    """Those readings in a row, through a matrix that is not the identity."""
     rng = np.random.default_rng(100 + seed)
     shaping = Shaping(mat3(np.eye(3) + rng.normal(0, 0.05, (3, 3)), "matrix"), ZERO3)
     gathering = Gathering()
     (first,) = samples("figure eight", 5, seconds=1.0)[:1]
-    for _ in range(n):
-        body = body_from_earth(*rng.uniform(-3, 3, 3))
+    for body, rate, drive in readings_of(seed, n):
         gathering.passes(0.07, body[:, 2], 1e-6)
-        s = replace(first, shaping=shaping, rate_b_rads=vec3(rng.normal(0, 0.5, 3), "rate"))
-        gathering.add(s, rng.normal(0, 300, 3), body, 0.01, float(rng.uniform(-0.5, 0.5)))
+        s = replace(first, shaping=shaping, rate_b_rads=vec3(rate, "rate"))
+        gathering.add(s, rng.normal(0, 300, 3), body, 0.01, drive)
     return gathering.close()
 
 
@@ -69,7 +77,9 @@ def test_every_column_of_the_jacobian_is_the_derivative(seed):
     """At S = 0, whatever the tilt error, mounting, delay and kappa."""
     x, block = states(seed), block_of(seed)
     x[:, at.E] = x[:, at.R] = x[:, at.T : at.T + 1] = x[:, at.KAPPA : at.KAPPA + 1] = 0.0
-    _, j, u = equation(x, block)
+    _, j, of_u = equation(x, block)
+    u = of_u[..., (2, 0, 1), (1, 2, 0)]
+    assert of_u == pytest.approx(-of_u.swapaxes(2, 3))
     assert np.linalg.norm(u, axis=2) == pytest.approx(np.tile(np.hypot(x[:, at.H], x[:, at.V]), (3, 1)).T)
     x[:, at.E] *= 10.0  # some six degrees
     _, j, _ = equation(x, block)
@@ -86,16 +96,15 @@ def test_the_equation_is_the_one_that_is_written():
     """Term by term, in plain matrices, for one hypothesis and one reading."""
     x, block = states(8, k=1), block_of(8, n=2)
     (y, *_), (row,) = equation(x, block)[0], x
-    for i in range(2):
-        r = np.column_stack((block.north_b[i], block.east_b[i], block.down_b[i]))
+    for i, (r, rate, drive) in enumerate(readings_of(8, 2)):
         a = row[at.ALPHA] - row[at.G] @ block.ahead_s[i]
         u = r @ (row[at.H] * math.cos(a), row[at.H] * math.sin(a), row[at.V])
-        lean = np.cross((0.0, 0.0, 1.0), block.down_b[i])
+        lean = np.cross((0.0, 0.0, 1.0), r[:, 2])
         moved = r @ (*row[at.E], 0.0) + (*row[at.R], 0.0) + row[at.KAPPA] * lean
-        q = moved + row[at.T] * block.rate_b_rads[i]
+        q = moved + row[at.T] * rate
         turned = u + np.cross(q, u) + 0.5 * np.cross(q, np.cross(q, u))
         want = (np.eye(3) + soft_matrix(row[at.S])) @ turned + block.shaping.matrix @ row[at.B]
-        assert y[i] == pytest.approx(want + row[at.D] + block.drive[i] * row[at.K])
+        assert y[i] == pytest.approx(want + row[at.D] + drive * row[at.K])
 
 
 def test_time_is_f_p_f_and_q():
@@ -159,9 +168,9 @@ def test_a_bank_of_one_is_filterpys_extended_kalman_filter_step_for_step(reading
         if i > readings:
             advance(copy_of, block.dt_s, block.down_s, block.turn_rad2, None, calm)
         theirs.x, theirs.P = copy_of.x[0], copy_of.p[0]
-        y, j, u = equation(copy_of.x, block)
+        y, j, of_u = equation(copy_of.x, block)
         r = np.kron(np.ones((readings, readings)), calm.common_mg**2 * np.eye(3))
-        for m, one in enumerate(smear(u, block, calm.sync_s)[0]):
+        for m, one in enumerate(smear(of_u, block, calm.sync_s)[0]):
             r[3 * m : 3 * m + 3, 3 * m : 3 * m + 3] += one + calm.white_mg**2 * np.eye(3)
         rows, said = j[0].reshape(-1, at.SIZE).copy(), y[0].ravel().copy()
         theirs.update(block.z.ravel(), lambda _, j=rows: j, lambda _, y=said: y, R=r)

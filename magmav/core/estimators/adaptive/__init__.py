@@ -26,7 +26,7 @@ from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import equation, smear, soft_matrix
+from magmav.core.estimators.adaptive.measurement import equation, shared_by_all, smear, soft_matrix
 from magmav.core.estimators.adaptive.opinion import doubt, joined, known, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
@@ -211,20 +211,20 @@ class AdaptiveEstimator:
         if self._matrix is not block.shaping.matrix:
             self._matrix = block.shaping.matrix
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
-        y, j, u = equation(bank.x, block)
+        y, j, of_u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
         self._met(nu[int(np.argmax(bank.log_weight))])
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         pj = bank.p @ rows.transpose(0, 2, 1)
         expected = rows @ pj
+        expected += bank.common_mg2[:, None, None] * shared_by_all(size, k)
+        expected.reshape(count, -1)[:, :: size * k + 1] += bank.white_mg2[:, None]
         apart = expected.reshape(count, size, k, size, k)
-        np.einsum("kiaja->kija", apart)[...] += bank.common_mg2[:, None, None, None]
         own = np.einsum("kiaib->kiab", apart)
-        own += smear(u, block, n.sync_s)[..., :k, :k]
-        np.einsum("kiaa->kia", own)[...] += bank.white_mg2[:, None, None]
+        own += smear(of_u, block, n.sync_s)[..., :k, :k]
         strange = doubted(own, nu, n.doubt_nis)
         inverse = np.linalg.inv(expected)
-        log_det = 2.0 * np.log(np.einsum("kii->ki", np.linalg.cholesky(expected))).sum(1)
+        log_det = np.linalg.slogdet(expected)[1]
         flat = nu.reshape(count, size * k)
         pull = (inverse @ flat[:, :, None])[:, :, 0]
         nis = (flat * pull).sum(1)
@@ -264,7 +264,7 @@ class AdaptiveEstimator:
         self._residual_n = 0
         self._change.open(bank)
         if self._model_mg is None and math.sqrt(bank.mixture()[1][at.H, at.H]) > n.blind_h_mg[1] * n.field_known:
-            field = (*n.blind_h_mg, float(block.z[-1] @ block.down_b[-1]), n.blind_v_mg)
+            field = (*n.blind_h_mg, float(block.z[-1] @ block.body_from_own[-1, :, 2]), n.blind_v_mg)
             self._bank = self._begun(field)
             self._blocks = 0
 

@@ -131,7 +131,7 @@ class Bank:
         The last reading then says where north is and, without a model, how strong the field.
         """
         u = block.z[-1] - block.shaping.matrix @ iron_mg
-        north, east, down = (float(axis[-1] @ u) for axis in (block.north_b, block.east_b, block.down_b))
+        north, east, down = (u @ block.body_from_own[-1]).tolist()
         doubt_mg = float(np.linalg.norm(sigma_mg))
         blind = (math.hypot(north, east), doubt_mg, down, doubt_mg)
         field = blind if model_mg is None else (model_mg[0], n.model_mg, model_mg[1], n.model_mg)

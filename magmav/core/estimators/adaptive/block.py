@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magmav.core.estimators.adaptive.layout import Array
+from magmav.core.estimators.adaptive.layout import SIZE, Array, B, D, K
 from magmav.core.types import Sample, Shaping
 
+_EYE3 = np.eye(3)
 _REST_RAD = 0.02  # what stood still may have turned: the field would hardly show less
 
 
@@ -20,8 +21,9 @@ _REST_RAD = 0.02  # what stood still may have turned: the field would hardly sho
 class Block:
     """n samples in arrays; body axes, mG, s, rad.
 
-    z (n, 3) : A m + e.  north_b, east_b, down_b (n, 3) : the own frame's axes.  rate_b_rads (n, 3).
-    turns_b (n, 3, 6) : about what each of the states layout.TURNS turns the field.  drive (n,) : throttle - 1/2.
+    z (n, 3) : A m + e.  body_from_own (n, 3, 3).  rate_rads2 (n,) : square of the turn rate.
+    turns_b (n, 3, 6) : about what each of the states layout.TURNS turns the field.
+    same (n, 3, SIZE) : the part of the Jacobian that depends on no state: iron, disturbance and throttle.
     calmed_rad (n,) : tilt taken out of the attitude, where it may be noise.
     ahead_s (n, 3) : integral of down_b from the sample to the block's end.
     own_tilt_rad : sigma of the tilt where it is that of gyro and accelerometer alone, None where it is the autopilot's.
@@ -30,13 +32,11 @@ class Block:
     """
 
     z: Array
-    north_b: Array
-    east_b: Array
-    down_b: Array
-    rate_b_rads: Array
+    body_from_own: Array
+    rate_rads2: Array
     turns_b: Array
     calmed_rad: Array
-    drive: Array
+    same: Array
     ahead_s: Array
     dt_s: float
     down_s: Array
@@ -125,15 +125,16 @@ class Gathering:
         turns[:, :, 5] = rates
         last = self._last
         assert last is not None  # nobody closes an empty one
+        same = np.zeros((len(rates), 3, SIZE))
+        same[..., B], same[..., D] = last.shaping.matrix, _EYE3
+        same[..., K] = np.array(self._drives)[:, None, None] * _EYE3
         out = Block(
             z=np.array(self._z),
-            north_b=bodies[:, :, 0],
-            east_b=bodies[:, :, 1],
-            down_b=down_b,
-            rate_b_rads=rates,
+            body_from_own=bodies,
+            rate_rads2=(rates * rates).sum(1),
             turns_b=turns,
             calmed_rad=np.array(self._calmed),
-            drive=np.array(self._drives),
+            same=same,
             ahead_s=self._down_s - np.array(self._downs),
             dt_s=self._dt_s,
             down_s=self._down_s,

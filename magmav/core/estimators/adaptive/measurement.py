@@ -11,6 +11,8 @@ attitude appear nowhere: no gimbal.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
@@ -36,43 +38,35 @@ _CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [
 
 
 def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
-    """Predicted A m + e (K, n, 3) mG, its Jacobian (K, n, 3, SIZE), and u (K, n, 3) mG.
+    """Predicted A m + e (K, n, 3) mG, its Jacobian (K, n, 3, SIZE), and [u x] (K, n, 3, 3) mG.
 
     The columns of H, V, tilt and soft iron are taken at S = 0: relinearised there, the product of field and soft
     iron invents information (estimation.md section 7.4).
     """
     k, n = len(x), len(block)
-    j = np.zeros((k, n, 3, at.SIZE))
-    j[..., at.D] = _EYE3
-    angle = (x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T)[:, :, None]
-    c, s = np.cos(angle), np.sin(angle)
-    h = x[:, at.H, None, None]
-    ahead = c * block.north_b + s * block.east_b  # the horizontal field's direction, and a right angle on from it
-    turned = h * (c * block.east_b - s * block.north_b)
-    u = h * ahead + x[:, at.V, None, None] * block.down_b
-    q = (block.turns_b @ x[:, None, at.TURNS, None])[..., 0]
-    around = cross_matrices(q)
-    turn = _EYE3 + around + 0.5 * (around @ around)
-    seen, turned, ahead, down = np.moveaxis(turn @ np.stack((u, turned, ahead, _like(block.down_b, k)), 3), 3, 0)
-    soft = soft_matrix(x[:, at.S])
-    constant = x[:, None, at.B] @ block.shaping.matrix.T + x[:, None, at.D]
-    y = seen + seen @ soft + constant + block.drive[:, None] * x[:, None, at.K]
-    turning = turned + turned @ soft
+    angle = x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T
+    own = np.zeros((k, n, 3, 4))  # own frame: the field, a right angle on from its level part, and 1 mG ahead and down
+    own[..., 0, 2], own[..., 1, 2], own[..., 2, 3] = np.cos(angle), np.sin(angle), 1.0
+    own[..., :2, 0] = x[:, at.H, None, None] * own[..., :2, 2]
+    own[..., 0, 1], own[..., 1, 1] = -own[..., 1, 0], own[..., 0, 0]
+    own[..., 2, 0] = x[:, at.V, None]
+    body = block.body_from_own @ own
+    around = cross_matrices((block.turns_b @ x[:, None, at.TURNS, None])[..., 0])
+    turned = (_EYE3 + around + 0.5 * (around @ around)) @ body
+    seen = turned[..., 0]
+    with_soft = (soft_matrix(x[:, at.S]) + _EYE3)[:, None] @ turned[..., :2]
+    y = with_soft[..., 0] + (x @ block.same.reshape(-1, at.SIZE).T).reshape(k, n, 3)
+    turning = with_soft[..., 1]
+    j = np.empty((k, n, 3, at.SIZE))
+    j[:] = block.same
     j[..., at.ALPHA] = turning
-    j[..., at.B] = block.shaping.matrix
-    j[..., at.H] = ahead
-    j[..., at.V] = down
-    j[..., at.K] = block.drive[:, None, None] * _EYE3
+    j[..., at.H : at.V + 1] = turned[..., 2:]
     j[..., at.S] = (seen @ _SOFT).reshape(k, n, 3, 6)
     j[..., at.G] = -turning[..., None] * block.ahead_s[:, None, :]
-    by_q = cross_matrices(u)
-    by_q = by_q + 0.5 * (cross_matrices((around @ u[..., None])[..., 0]) + around @ by_q)
+    of_u = cross_matrices(body[..., 0])
+    by_q = of_u + around @ of_u - 0.5 * (of_u @ around)  # with [(q x u) x] = [q x] [u x] - [u x] [q x]
     j[..., at.TURNS] = -(by_q @ block.turns_b)
-    return y, j, u
-
-
-def _like(values: Array, k: int) -> Array:
-    return np.broadcast_to(values, (k, *values.shape))
+    return y, j, of_u
 
 
 def cross_matrices(v: Array) -> Array:
@@ -81,10 +75,17 @@ def cross_matrices(v: Array) -> Array:
     return out
 
 
-def smear(u: Array, block: Block, sync_s: float) -> Array:
-    """(K, n, 3, 3) mG^2: what a mismatch in time or tilt does to the field; it never changes the field's length."""
-    share = sync_s**2 * (block.rate_b_rads * block.rate_b_rads).sum(1) + block.calmed_rad**2
-    out: Array = (-share[:, None, None] * u[..., :, None]) * u[..., None, :]
-    diagonal = out.reshape(*out.shape[:2], 9)[..., ::4]
-    diagonal += (share * (u * u).sum(2))[..., None]
+@cache
+def shared_by_all(n: int, axes: int) -> Array:
+    """(n axes, n axes): one where two numbers of a block belong to the same axis."""
+    return np.tile(np.eye(axes), (n, n))
+
+
+def smear(of_u: Array, block: Block, sync_s: float) -> Array:
+    """(K, n, 3, 3) mG^2: what a mismatch in time or tilt does to the field; it never changes the field's length.
+
+    of_u (K, n, 3, 3) : [u x], whose square is u u' - |u|^2 I.
+    """
+    share = sync_s**2 * block.rate_rads2 + block.calmed_rad**2
+    out: Array = -share[:, None, None] * (of_u @ of_u)
     return out
