@@ -143,7 +143,6 @@ def test_AT_15a_fit_refuses_a_compass_at_right_angles_and_prints_what_to_set(tmp
     assert "YAW_90" in to_text(fit_view({"logs": [result]}))
 
 
-@pytest.mark.long
 def test_AT_15b_thirty_degrees_are_said_to_be_thirty_and_not_hidden_in_the_offsets(tmp_path):
     (path,) = flown(tmp_path, "soft_iron", seconds=115.0, soft=about_down(30.0))
     fit = only(magmav.fit(path))["fit"]
@@ -179,7 +178,6 @@ def test_AT_10a_what_is_written_takes_the_motors_away_at_every_current(motor):
         assert np.linalg.norm(correction.apply(tuple(read), 0.0, ampere)) < 20.0
 
 
-@pytest.mark.long
 def test_AT_10b_where_no_power_is_known_that_is_said_and_the_iron_is_that_of_average_power(motor_log, monkeypatch):
     from magmav.core.types import CurrentReading, ThrottleReading
     from magmav.logs.dataflash_readings import DataflashRecording
@@ -224,7 +222,6 @@ def correction_of(values):
     return Correction(None, three("OFS"), values["COMPASS_SCALE"], three("DIA"), three("ODI"), three("MOT"), mode)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("options", [magmav.FitOptions(), magmav.FitOptions(soft_iron=True)], ids=["plain", "soft"])
 def test_AT_16b_the_file_and_what_stays_reproduce_the_predicted_field(bent, options):
     """Closure: what the file says, read back as text, through the simulator's ArduPilot, against the prediction."""
@@ -243,7 +240,6 @@ def test_AT_16b_the_file_and_what_stays_reproduce_the_predicted_field(bent, opti
     assert entry["fit"]["parameters"]["closure_mg"] == pytest.approx(off[columns["taught"]].max(), abs=1e-3)
 
 
-@pytest.mark.long
 def test_soft_iron_that_was_asked_for_is_found_and_makes_the_field_round(bent):
     spec = load_scenario("soft_iron").compasses[0]
     (path, _) = bent
@@ -291,12 +287,10 @@ def test_AT_4a_the_document_holds_what_a_report_must(three):
     json.dumps(result, allow_nan=False)
 
 
-@pytest.mark.long
 def test_the_same_log_gives_the_same_document(eights, three):
     assert magmav.fit(eights[1]) == three["bin"]
 
 
-@pytest.mark.long
 def test_parameter_files_are_what_each_ground_station_reads(motor, motor_log, tmp_path):
     changed = only(motor)["fit"]["parameters"]["changed"]
     words = ["fit", str(motor_log), "--motor", "--json"]
@@ -306,7 +300,7 @@ def test_parameter_files_are_what_each_ground_station_reads(motor, motor_log, tm
     assert {n: float(np.float32(v)) for n, v in plain.items()} == changed
     rows = [line for line in (tmp_path / "new.params").read_text().splitlines() if not line.startswith("#")]
     cells = [row.split("\t") for row in rows]
-    assert all(c[0] == "1" and c[1] == "1" and c[4] == "9" for c in cells)
+    assert all(c[0] == "1" and c[1] == "1" and c[4] == ("2" if c[2] == "COMPASS_MOTCT" else "9") for c in cells)
     assert {c[2]: float(np.float32(c[3])) for c in cells} == changed
 
 

@@ -1,8 +1,9 @@
 """A fit as parameters in the autopilot's own names, and as the files that ground stations load.
 
 Mission Planner and MAVProxy read lines of NAME,VALUE (.param, .parm). QGroundControl reads its own .params: comment
-lines, then vehicle id, component id, name, value and type with tabs between (type 9: 32-bit float). A file holds only
-what changes.
+lines, then vehicle id, component id, name, value and MAV_PARAM_TYPE with tabs between. It leaves out, with a message,
+what has another type on the vehicle, and takes no file of another system id (its ParameterManager.cc); so what the
+autopilot holds as a whole number is written as one. A file holds only what changes.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from magmav.mavlink.float32 import float32, same
 
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT
 _REAL32 = 9  # MAV_PARAM_TYPE_REAL32
+_WHOLE = {"COMPASS_MOTCT": 2, "CAL_MAG_COMP_TYP": 6}  # of what is ever written: MAV_PARAM_TYPE_INT8 and _INT32
 _AUTOPILOT = 1  # its component
 _MOTCT = "COMPASS_MOTCT"
 _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5  # ArduPilot leaves out a scale beyond
@@ -157,20 +159,25 @@ def as_the_autopilot_would(
     return np.asarray((sensor_b_mg + base) @ shaping.matrix.T + power[:, None] * per_unit)
 
 
-def number(value: float) -> str:
-    """The shortest decimal number that is this 32-bit float."""
-    return str(np.float32(value))
+def number(name: str, value: float) -> str:
+    """The shortest decimal number that is this 32-bit float; no point in it where the parameter is a whole number."""
+    return str(int(value)) if name in _WHOLE else str(np.float32(value))
 
 
 def as_param(changed: Mapping[str, float]) -> str:
     """Lines of NAME,VALUE."""
-    return "".join(f"{name},{number(value)}\n" for name, value in changed.items())
+    return "".join(f"{name},{number(name, value)}\n" for name, value in changed.items())
 
 
 def as_qgc(changed: Mapping[str, float], system: int, comments: Iterable[str] = ()) -> str:
-    """QGroundControl's own format."""
-    head = ["# Onboard parameters", "#", *(f"# {c}" for c in comments), "# Vehicle-Id Component-Id Name Value Type"]
-    rows = [f"{system}\t{_AUTOPILOT}\t{name}\t{number(value)}\t{_REAL32}" for name, value in changed.items()]
+    """QGroundControl's own format. A comment stays one line, whatever a file is called."""
+    said = ("".join(c if c.isprintable() else "?" for c in comment) for comment in comments)
+    head = [f"# Onboard parameters for Vehicle {system}", "#", *(f"# {c}" for c in said), "#"]
+    head.append("# Vehicle-Id Component-Id Name Value Type")
+    rows = [
+        f"{system}\t{_AUTOPILOT}\t{name}\t{number(name, value)}\t{_WHOLE.get(name, _REAL32)}"
+        for name, value in changed.items()
+    ]
     return "\n".join([*head, *rows]) + "\n"
 
 
