@@ -106,6 +106,7 @@ class MagCompanion:
         self.writer = Writer(
             pipeline,
             self._watch,
+            self._fetch,
             store,
             self.announcer,
             records=self._records,

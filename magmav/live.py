@@ -107,7 +107,7 @@ def transact(
                 return {"result": "REFUSED", "compass": compass, "reasons": _reasons((Reason.LINK_SIGNED_READ_ONLY,))}
             ready = companion.writer.identified or companion.presence.autopilot is None
             if chosen is None and ready and (asked or not dry):
-                device = _device(session, compass)
+                device = _device(session, compass) if companion.writer.mapped else 0
                 if device:
                     chosen = pick(device)
                     change = chosen.change if isinstance(chosen, Write) else chosen

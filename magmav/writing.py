@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterable, Mapping
 
 from magmav.core.types import AxisState, Change, Reason, Record, State, UploadResult
 from magmav.mavlink.announce import Announcer
+from magmav.mavlink.autopilot.adapter import ADAPTERS, adapter_of
 from magmav.mavlink.autopilot.plan import plan_change
 from magmav.mavlink.change import adapter_for, code_needed, largest_step_mg
 from magmav.mavlink.codec import Message, Outgoing
+from magmav.mavlink.fetch import ParamFetch
 from magmav.mavlink.kept import Keeping, Kept
 from magmav.mavlink.terms import UploadSettings
 from magmav.mavlink.uid import Uid, has_uid, may_be_same
@@ -29,6 +31,7 @@ STALE_NS = 2_000_000_000
 _RETRY_RESTORE_NS = 30_000_000_000
 _ASK_AGAIN_NS = 500_000_000
 _CRITICAL, _WARNING, _INFO = 2, 4, 6
+_ARDUPILOT = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 _WHOLE = (UploadResult.ALL_NEW, UploadResult.WRITTEN_UNPROVEN, UploadResult.ALL_OLD)
 _NOT_OURS = frozenset({Reason.OFFSETS_CHANGED, Reason.DEVICE_CHANGED, Reason.WRONG_VEHICLE})
 
@@ -45,6 +48,7 @@ class Writer:
         self,
         pipeline: Pipeline,
         watch: Watch,
+        fetch: ParamFetch,
         store: Store,
         announcer: Announcer,
         *,
@@ -61,6 +65,7 @@ class Writer:
         self._pipeline = pipeline
         self._presence = watch.presence
         self._watch = watch
+        self._fetch = fetch
         self._store = store
         self._announcer = announcer
         self._records = records
@@ -85,6 +90,13 @@ class Writer:
     def identified(self) -> bool:
         """Its number is known, or it was asked often enough."""
         return self._uid.settled
+
+    @property
+    def mapped(self) -> bool:
+        """Which compass is in which slot was read, as far as the vehicle says it; only then a write is sure (S6)."""
+        autopilot = self._presence.autopilot
+        adapter = (None if autopilot is None else adapter_of(autopilot.kind)) or ADAPTERS[_ARDUPILOT]
+        return self._fetch.settled(adapter.whose(self._fetch.heard))
 
     def flown(self) -> Flown | None:
         """The served vehicle in the pipeline."""
@@ -148,7 +160,8 @@ class Writer:
             confirm=confirm,
             undoes=undoes,
             vehicle=self.vehicle,
-            against=None if flown is None else flown.calibrations.refuses(change.compass),
+            against=lambda: None if flown is None else flown.calibrations.refuses(change.compass),
+            mapped=lambda: self.mapped,
             unix_offset_ns=self._unix_offset_ns,
             settings=limits,
         )

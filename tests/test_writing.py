@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from flight_rig import SpyLink
 from magmav_sim import Simulation, parse_scenario
 from magmav_sim.link import ROUTE, SimulatedLink
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -55,6 +56,81 @@ def test_AT_6b_device_id_that_two_compasses_have_is_refused_and_nothing_written(
     assert ended.reasons == (Reason.MAPPING_UNCLEAR,)
     assert tuple(vehicle.params[n] for n in NAMES) == OLD and bench.store.history() == []
     bench.store.close()
+
+
+@pytest.mark.parametrize("command", ["upload", "restore"])
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        ({"COMPASS_DEV_ID2": 97539.0}, "MAPPING_UNCLEAR"),
+        ({"COMPASS_PRIO1_ID": 55.0}, "MAPPING_UNCLEAR"),  # of no slot
+        # Another slot's device is streamed as compass 1; of that nothing was learnt, and nothing was written to it.
+        ({"COMPASS_DEV_ID2": 131874.0, "COMPASS_PRIO1_ID": 131874.0, "COMPASS_PRIO2_ID": 97539.0}, "NO_"),
+    ],
+)
+def test_S6_AT_6b_one_command_reads_whose_slot_is_whose_before_it_writes(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    spoil: dict[str, float],
+    why: str,
+) -> None:
+    """A command begins as soon as it knows enough: that is not before all device ids are known."""
+    simulation = Simulation(parse_scenario(GROUND, "ground.toml"), 3)
+    for name, value in spoil.items():
+        simulation.autopilot.parameters.put(name, value)
+    new = (-100.0, 50.0, -60.0)
+    change = Change(1, 1, "COMPASS_DEV_ID", 97539, NAMES, (0.0,) * 3, new, new, (2.0,) * 3, tuple(map(abs, new)))
+    path = tmp_path / "s.sqlite"
+    with Store(path) as store:
+        store.save_estimate(SavedEstimate(7, "1", change, VERDICT, SAVED.offsets_mg, SAVED.sigma_mg))
+        if command == "restore":
+            store.begin(change, 5, vehicle="1")  # cut short
+    held = tuple(float(simulation.autopilot.parameters[name]) for name in NAMES)
+    spy = SpyLink(SimulatedLink(simulation, until_s=90.0), simulation)
+    spy.warning = ""  # type: ignore[attr-defined]
+    monkeypatch.setattr("magmav.link.open.open_link", lambda text: spy)
+    assert main([command, "udpin:127.0.0.1:0", "--store", str(path), "--json"]) == 1
+    out = json.loads(capsys.readouterr().out)
+    assert out["result"] == "REFUSED" and [r["code"][: len(why)] for r in out["reasons"]] == [why]
+    reader = dialect.MAVLink(None)
+    sent = {m.get_type() for one in spy.sent for m in (reader.parse_buffer(one.data) or [])}
+    assert "PARAM_REQUEST_READ" in sent and "PARAM_SET" not in sent
+    assert tuple(float(simulation.autopilot.parameters[name]) for name in NAMES) == held
+
+
+@pytest.mark.parametrize("late_s", [0.0, 6.0])
+@pytest.mark.parametrize("at_s", [1.0, 3.3, 3.6, 4.0, 5.0, 9.0])
+def test_S6_AT_6b_a_way_back_asked_for_early_waits_until_all_device_ids_are_known(
+    tmp_path: Path, at_s: float, late_s: float
+) -> None:
+    """Also where the answer that matters comes late: what was asked for before was lost."""
+    vehicle = Vehicle()
+    twice = {"COMPASS_DEV_ID2": vehicle.params["COMPASS_DEV_ID"]}
+    vehicle.at.append((vehicle.now_ns + round(late_s * 1e9), lambda: vehicle.params.update(twice)))
+    vehicle.params[NAMES[0]] = vehicle.applied[NAMES[0]] = a_change().new[0]
+    held = tuple(vehicle.params[n] for n in NAMES)
+    with Store(tmp_path / "s.sqlite") as store:
+        store.begin(a_change(), 5)  # cut short by an earlier companion
+    bench = Bench(tmp_path / "s.sqlite", vehicle)
+    bench.run(at_s)
+    bench.companion.request_restore(1, vehicle.now_ns)
+    bench.run(20.0)
+    assert not vehicle.sets and tuple(vehicle.params[n] for n in NAMES) == held
+    assert any("REFUSED: not clear which stored" in text for text in bench.texts)
+    bench.store.close()
+
+
+def test_S6_a_vehicle_that_does_not_say_whose_slot_is_whose_is_not_written_to() -> None:
+    rig = Rig()
+    begin_ns = rig.vehicle.now_ns
+    refused(rig, Reason.UNKNOWN_PARAM, mapped=lambda: False)
+    assert rig.vehicle.now_ns - begin_ns <= 10.1e9
+    rig = Rig()
+    known_ns = rig.vehicle.now_ns + 4_000_000_000
+    assert rig.go(mapped=lambda: rig.vehicle.now_ns >= known_ns).result is UploadResult.ALL_NEW
+    assert rig.vehicle.sets[0][0] >= known_ns
 
 
 def test_AT_4c_a_refused_write_does_not_end_the_wait_for_the_reboot_of_the_one_before(tmp_path: Path) -> None:

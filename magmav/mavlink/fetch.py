@@ -63,7 +63,12 @@ class ParamFetch:
     @property
     def done(self) -> bool:
         """Everything is either heard or absent."""
-        return all(state.heard or state.absent for state in self._state.values())
+        return self.settled(self._state)
+
+    def settled(self, names: Iterable[str]) -> bool:
+        """Each of these is either heard or absent. A name that was never wanted is neither."""
+        states = map(self._state.get, names)
+        return all(state is not None and (state.heard or state.absent) for state in states)
 
     def restart(self) -> None:
         """Read all again: the vehicle rebooted, its offsets may be others now."""

@@ -18,6 +18,8 @@ change, for an undo too (an undo that works ends ALL_OLD). REFUSED: nothing was 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from magmav.core.types import Change, Reason, UploadResult
@@ -39,7 +41,8 @@ class Upload:
     """One change, or with ``undoes`` (the journal row it undoes) its way back. Feed it everything.
 
     watch : long-lived, may be fed by others too.  confirm : the code, for a change above 150 mG (never asked
-    of an undo).  vehicle : key for the journal.  against : what those who know more of this vehicle have against it.
+    of an undo).  vehicle : key for the journal.  against : what those who know more of this vehicle have against it,
+    asked until the first write.  mapped : whether they know it; nothing is written before.
     row : of the journal, once there is one.  result : None until the end; ``reasons`` say why.
     """
 
@@ -54,7 +57,8 @@ class Upload:
         vehicle: str = "",
         unix_offset_ns: int = 0,
         settings: UploadSettings | None = None,
-        against: Reason | None = None,
+        against: Callable[[], Reason | None] = lambda: None,
+        mapped: Callable[[], bool] = lambda: True,
     ) -> None:
         self._adapter = changes.adapter_for(change)
         self.change = self._adapter.checked(change)
@@ -84,7 +88,7 @@ class Upload:
             Phase.SEEN_OUT: self._seen_out,
             Phase.ARMING: self._arming,
         }
-        self._against = against
+        self._against, self._mapped = against, mapped
         self._streams = self._adapter.proof_streams(change.compass)
         self._talk = Dialogue(self._adapter, (0, 0, ""), ())
         self._arming_check: ArmingCheck | None = None
@@ -134,7 +138,6 @@ class Upload:
             why.append(Reason.NOTHING_TO_DO)
         elif not self._undo and changes.is_too_small(self.change):
             why.append(Reason.TOO_SMALL)
-        why += [] if self._against is None else [self._against]
         why += self._value_refusals()
         code = None if self._undo else changes.code_needed(self.change, self._set.confirm_above_mg)
         if code is not None and self._confirm != code:
@@ -193,14 +196,15 @@ class Upload:
         return why
 
     def _value_refusals(self) -> tuple[Reason, ...]:
-        limit = self._set.offs_max_mg
-        return changes.value_refusals(self.change, self._talk.stored, undo=self._undo, offs_max_mg=limit)
+        why, limit = self._against(), self._set.offs_max_mg
+        read = changes.value_refusals(self.change, self._talk.stored, undo=self._undo, offs_max_mg=limit)
+        return read if why is None else (why, *read)
 
     # ------------------------------------------------------------ the steps
 
     def _preflight(self, now_ns: int) -> None:
         waiting = wait_reasons(self._watch, self._set, now_ns)
-        if self._talk.asking.open:
+        if self._talk.asking.open or not self._mapped():
             waiting.insert(0, Reason.UNKNOWN_PARAM)
         since_ns = self._watch.since_ns
         watched = since_ns is not None and now_ns - since_ns >= self._set.watch_ns

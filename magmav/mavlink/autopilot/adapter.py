@@ -55,6 +55,13 @@ class Adapter(Protocol):
         """
         ...
 
+    def whose(self, answered: Collection[str]) -> tuple[str, ...]:
+        """Parameters that say which compass is in which slot. Before each was heard or is absent none is sure (S6).
+
+        answered : as for ``names``, and among those.
+        """
+        ...
+
     def offset_names(self, compass: int) -> tuple[str, str, str]:
         """Offsets of this compass while nothing is known of the vehicle; a plan takes StoredCalibrations.names."""
         ...

@@ -89,10 +89,15 @@ class ArduPilot:
         scheme, wanted = scheme_of(answered), tuple(compasses)
         settled = any(name in answered for c in COMPASSES for each in (CLASSIC, NUMBERED) for name in each.offsets(c))
         names = [] if settled else [FEELER]
-        names += [priority_name(compass) for compass in wanted]  # what a vehicle may not have first: silence takes long
+        names += self.whose(answered)  # what a vehicle may not have first: silence takes long
         for compass in wanted:
             names += [*scheme.offsets(compass), scheme.device(compass), *scheme.shaping(compass)]
         return tuple(dict.fromkeys(names))
+
+    def whose(self, answered: Collection[str]) -> tuple[str, ...]:
+        """The order of priority, and the device ids of all slots."""
+        scheme = scheme_of(answered)
+        return (*map(priority_name, COMPASSES), *map(scheme.device, COMPASSES))
 
     def offset_names(self, compass: int) -> tuple[str, str, str]:
         """COMPASS_OFS_X and its kin for this compass."""

@@ -55,8 +55,12 @@ class Px4:
 
     def names(self, compasses: Iterable[int], answered: Collection[str] = ()) -> tuple[str, ...]:
         """All slots, whichever compasses are asked for: a compass may be in any."""
-        ids = [f"CAL_MAG{n}_ID" for n in SLOTS]  # first: they say which slots count
+        ids = self.whose(answered)  # first: they say which slots count
         return tuple(dict.fromkeys([*ids, *(name for n in SLOTS for name in slot_names(n)), *COMMON, AUTOCAL]))
+
+    def whose(self, answered: Collection[str]) -> tuple[str, ...]:
+        """The device ids of all slots."""
+        return tuple(f"CAL_MAG{n}_ID" for n in SLOTS)
 
     def offset_names(self, compass: int) -> tuple[str, str, str]:
         """Offsets of the slot a vehicle with its compasses in order would use."""
