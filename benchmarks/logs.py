@@ -1,7 +1,8 @@
 """How fast logs are read and fitted, against pymavlink's readers and MAVProxy's magfit on the same files.
 
     python benchmarks/logs.py [FILE.bin] [--tlog FILE.tlog] [--damage N]     readers
-    python benchmarks/logs.py --hour [MINUTES]     whole `magmav fit` of a written hour, one compass and three
+    python benchmarks/logs.py --hour [MINUTES]     whole `magmav fit` of a written hour, one compass and three,
+                                                   and of a .bin of it (AT-14d: 60 s)
     python benchmarks/logs.py --magfit             all compasses of FILE.bin in one run, against one magfit each
 
 Both sides give every column of the same messages as numbers; ours in this process, theirs (GPL) in a process of its
