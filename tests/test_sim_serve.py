@@ -19,6 +19,7 @@ from sim_rig import COMPASS, Ground, simulation
 
 from magmav.link import LinkError
 from magmav.link.memory import SetClock, memory_pair
+from magmav.link.open import stays_here
 from magmav.link.udp import udp_in
 
 
@@ -87,6 +88,23 @@ def test_frames_share_datagrams_without_being_cut():
     assert b"".join(out) == b"".join(frames)
 
 
+SHORT = """
+seed = 5
+airframe = "F450"
+date = 2026-11-22T10:00:00Z
+place = { lat_deg = 47.3977, lon_deg = 8.5456, alt_m = 488.0 }
+[[compass]]
+device_id = 97539
+hard_iron_mg = [80.0, -20.0, 40.0]
+noise_mg = 4.0
+[[flight]]
+pattern = [
+    { kind = "takeoff", height_m = 12.0, climb_mps = 3.0 },
+    { kind = "yaw", turns = 1.0, rate_dps = 36.0 },
+    { kind = "land", sink_mps = 2.0 },
+]
+"""
+
 FLIGHT = """
 [[flight]]
 ground_s = 2.0
@@ -132,6 +150,58 @@ def test_program_says_what_is_wrong_and_keeps_standard_output_clean(tmp_path, ca
     for word in ("--to", "--speed", "nonsense", "carrier pigeon", "--truth"):
         assert word in heard.err
     assert main(["--help"]) == 0
+
+
+@pytest.mark.parametrize(
+    "to",
+    ["udpout:192.0.2.7:14550", "udpin:0.0.0.0:14550", "udpin:[::]:14550", "tcp:192.0.2.7:5760",
+     "tcp:[2001:db8::1]:5760", "udpout:255.255.255.255:14550", "udpout:[::ffff:192.0.2.7]:14550",
+     "serial:/dev/ttyUSB0:57600", "serial:/dev/null"],
+)  # fmt: skip
+def test_S15_the_simulator_speaks_on_this_machine_only(to, capsys, monkeypatch):
+    def refused(*args, **kwargs):
+        raise AssertionError("a socket was opened")
+
+    monkeypatch.setattr("socket.socket", refused)
+    assert main(["demo", "--to", to]) == 4
+    assert to in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("to", ["udpout:127.0.0.1:14550", "udpin::14550", "udpin:[::1]:0", "tcp:127.3.2.1:5760"])
+def test_loopback_is_this_machine(to):
+    assert stays_here(to) == to
+
+
+# An audit hook sees every socket however it is come by, and cannot be taken off again.
+GUARDED = """
+import sys
+def guard(event, args):
+    if event in ("socket.bind", "socket.connect", "socket.sendto") or event == "socket.__new__" and args[1] != 1:
+        raise SystemExit(f"{event} {args}")
+sys.addaudithook(guard)
+from magmav.cli import main
+for words in eval(sys.argv[1]):
+    assert main(words) == 0, words
+try:
+    main(["sim", "demo", "--to", "udpout:127.0.0.1:9"])
+except SystemExit as hit:
+    assert "socket" in str(hit)
+else:
+    raise AssertionError("the guard sees nothing")
+"""
+
+
+def test_S15_no_file_mode_opens_a_socket(tmp_path):
+    """Flying into files, and replaying and fitting each of them; a unix socket is none that leaves the machine."""
+    (tmp_path / "short.toml").write_text(SHORT)
+    files = [str(tmp_path / f"f.{kind}") for kind in ("tlog", "bin", "ulg")]
+    words = [["sim", str(tmp_path / "short.toml"), "--write", *files]]
+    words += [["replay", path, "--json"] for path in files]
+    words += [["fit", files[1], "--json", "--out", str(tmp_path / "out"), "--params", str(tmp_path / "new.param")]]
+    done = subprocess.run(
+        [sys.executable, "-c", GUARDED, repr(words)], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr[-2000:] + done.stdout[-500:]
 
 
 def answering(link, seconds_of_simulation):

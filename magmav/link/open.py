@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from magmav.link import Link, LinkError
+from magmav.link.addresses import is_loopback, resolve_udp
 from magmav.link.serial import serial
 from magmav.link.tcp import tcp
 from magmav.link.tlog import TlogLink
@@ -48,6 +49,19 @@ def open_link(
     if scheme == "udpout":
         return udp_out(host, port, tick_s=tick_s)
     return tcp(host, port, tick_s=tick_s, retry_s=retry_s, longest_retry_s=longest_retry_s)
+
+
+def stays_here(text: str) -> str:
+    """The text of a link that reaches nothing but this machine; LinkError for any other (S15). Nothing is opened."""
+    scheme, _, rest = text.partition(":")
+    if scheme not in _SCHEMES:
+        raise LinkError(_not_understood(text, ""))
+    if scheme == "serial":
+        raise LinkError(f"{text}: a vehicle may be at the other end of a serial device; use 127.0.0.1")
+    host, port = _host_and_port(text, rest)
+    if host and not is_loopback(str(resolve_udp(text, host, port)[1][0])):
+        raise LinkError(f"{text}: reaches beyond this machine, where a vehicle may listen; use 127.0.0.1")
+    return text
 
 
 def _host_and_port(text: str, rest: str) -> tuple[str, int]:

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import NoReturn
 
 from magmav.link import Link, LinkError
-from magmav.link.open import open_link
+from magmav.link.open import open_link, stays_here
 from magmav_sim.recorder import Recorder, kinds, recordable, unattended
 from magmav_sim.scenario import ScenarioError, has_second_route, with_autopilot
 from magmav_sim.scenario_file import load_scenario, scenario_files
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ScenarioError as error:
         return _fail(_NO_INPUT, str(error), options.json)
     try:
-        link = None if options.to is None else open_link(options.to, tick_s=_TICK_S)
+        link = None if options.to is None else open_link(stays_here(options.to), tick_s=_TICK_S)
         second = None if link is None or not has_second_route(scenario) else open_link(options.to, tick_s=_TICK_S)
     except LinkError as error:
         return _fail(_NO_LINK, str(error), options.json)
@@ -111,7 +111,7 @@ def _parser(as_json: bool) -> argparse.ArgumentParser:
     parser.add_argument("--json", action="store_true", help="at the end, what was true, as JSON")
     known = ", ".join(scenario_files())
     parser.add_argument("scenario", nargs="?", default="demo", help=f"a .toml file, or one of: {known}")
-    parser.add_argument("--to", metavar="LINK", help="e.g. udpout:127.0.0.1:14550")
+    parser.add_argument("--to", metavar="LINK", help="on this machine, e.g. udpout:127.0.0.1:14550")
     parser.add_argument(
         "--write",
         type=_recording,
