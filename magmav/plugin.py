@@ -14,7 +14,7 @@ from pathlib import Path
 
 from magmav.coaching import Coaching
 from magmav.companion import MagCompanion, wanted_rates
-from magmav.core.types import FieldModel, Reading, Reason, Record, State
+from magmav.core.types import Change, FieldModel, Reading, Reason, Record, State
 from magmav.dry import every_message
 from magmav.link.fed import FedLink
 from magmav.live import Session, history_entry
@@ -29,7 +29,7 @@ COMMANDS = ("status", "upload", "restore", "history")
 USAGE = (
     "magmav status                            what is known of each compass, and what is being written",
     "magmav upload [1|2|3] [--dry-run] [--confirm-change CODE]   write what was learnt, with proof",
-    "magmav restore [1|2|3]                   bring back the values from before the last upload",
+    "magmav restore [1|2|3] [--dry-run]       bring back the values from before the last upload",
     "magmav history [N]                       the last writes, and how they ended",
 )
 _HISTORY, _MOST_HISTORY = 10, 200
@@ -149,10 +149,14 @@ class Desk:
         return self._begun(compass, "upload")
 
     def _restore(self, words: list[str]) -> list[str]:
-        compass = _compass("restore", words)
+        dry, rest = "--dry-run" in words, [word for word in words if word != "--dry-run"]
+        compass = _compass("restore", rest)
         problem = self._nobody() or self._busy()
         if problem:
             return [problem]
+        if dry:
+            row = self._companion.writer.restorable(compass)
+            return [f"refused: {Reason.NO_SNAPSHOT.text}"] if row is None else self._messages(row.change, undo=True)
         self._companion.request_restore(compass, self._session.service.now_ns)
         return self._begun(compass, "restore")
 
@@ -199,11 +203,14 @@ class Desk:
         if change is None:
             return [f"compass {compass}: nothing to write; magmav status says what is missing"]
         ready = record is not None and record.verdict.state is State.READY
+        lines = self._messages(change, undo=False)
+        return [*([] if ready else [f"compass {compass} is not READY: an upload would be refused"]), *lines]
+
+    def _messages(self, change: Change, *, undo: bool) -> list[str]:
         flown, settings = self._companion.flown(), self._companion.settings
         held = [] if flown is None else [name for c in COMPASSES for name in flown.calibrations.stored(c)]
         rates = wanted_rates(settings, self._companion.kind)
-        lines = every_message(change, rates, held, settings.upload.confirm_above_mg)
-        return [*([] if ready else [f"compass {compass} is not READY: an upload would be refused"]), *lines]
+        return every_message(change, rates, held, settings.upload.confirm_above_mg, undo=undo)
 
     def _outcome(self, ended: Upload) -> list[str]:
         compass = ended.change.compass

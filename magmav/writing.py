@@ -123,10 +123,8 @@ class Writer:
 
     def request_restore(self, compass: int, now_ns: int) -> None:
         """Bring back the values from before the last upload of this compass."""
-        flown = self.flown()
-        device = 0 if flown is None else flown.calibrations.device_id(compass)
         try:
-            row = self._store.last_restorable(self._presence.system, compass, device, self.vehicle)
+            row = self.restorable(compass)
         except StoreError as error:
             _log.error("%s", error)
             row = None
@@ -136,6 +134,12 @@ class Writer:
             self.refuse(Reason.NO_SNAPSHOT, now_ns)
         else:
             self.start(row.change, None, now_ns, undoes=row.id)
+
+    def restorable(self, compass: int) -> Write | None:
+        """The last upload of this compass that can be taken back. StoreError where the record cannot be read."""
+        flown = self.flown()
+        device = 0 if flown is None else flown.calibrations.device_id(compass)
+        return self._store.last_restorable(self._presence.system, compass, device, self.vehicle)
 
     def plan(self, compass: int) -> Change | None:
         """The change the present estimate asks for, on the axes that are known; None when there is none."""

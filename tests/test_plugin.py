@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from test_dry_run import line
 
+from magmav.core.types import Reason
 from magmav.geomag import world_magnetic_model
 from magmav.link.fed import FedLink
 from magmav.link.memory import SetClock
@@ -146,8 +147,13 @@ class Story:
         self.uploaded = desk.news()
         self.new = [f.value(n) for n in _OFFSETS]
         self.other = desk.answer(["restore", "2"])
+        self.dry_back = desk.answer(["restore", "--dry-run"]), desk.answer(["restore", "2", "--dry-run"])
+        f.fly(seconds=2.0)
+        self.quiet += self.sets()
+        self.still = [f.value(n) for n in _OFFSETS]
         self.back = desk.answer(["restore"])
         f.fly(lambda: f.companion.job is None, 60.0)
+        self.sent_back = {line(m) for m in f.said()}
         self.restored = desk.news()
         self.last = [f.value(n) for n in _OFFSETS]
         self.history = desk.answer(["history"]), desk.answer(["history", "1"]), desk.answer(["status"])
@@ -198,6 +204,17 @@ def test_the_dry_run_names_every_message_of_the_write_and_the_code_and_sends_non
     assert any(text.startswith("COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL RAW_IMU") for text in said)
     assert any(f"confirm with code {story.code}" in text for text in story.dry)
     assert story.quiet == []
+
+
+def test_the_dry_run_of_a_restore_names_every_message_of_the_way_back_and_sends_none(story):
+    dry, other = story.dry_back
+    said = {text.split(" (")[0] for text in dry}
+    assert story.sent_back - said <= {"NAMED_VALUE_FLOAT"}, sorted(story.sent_back - said)
+    sets = {text for text in said if text.startswith("PARAM_SET")}
+    assert sets == {f"PARAM_SET {n} {v!r}" for n, v in zip(_OFFSETS, story.old, strict=True)} <= story.sent_back
+    assert not any("confirm with code" in text for text in dry)
+    assert story.still == story.new and story.quiet == []
+    assert other == [f"refused: {Reason.NO_SNAPSHOT.text}"] == story.other
 
 
 def test_upload_and_restore_go_through_the_transaction(story):
