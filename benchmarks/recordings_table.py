@@ -3,7 +3,8 @@
     recordings_table.py [--only NAMES] [--files PART,...] [--write docs/fit.md]
 
 Each column is fitted on the first half of what taught and scored on the second, on the same samples. The recordings are
-found through MAGMAV_DATA. --write puts the table between the marks in that page.
+found through MAGMAV_DATA (exit code 3 where there are none). --write puts the table between the marks in that page,
+at the end and in one go. A recording that cannot be read has a line that says so.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from typing import Any
 import magmav
 from magmav.comparison import METHODS, compare
 from magmav.geomag import world_magnetic_model
+from magmav.link import LinkError
+from magmav.logs import LogError
 from magmav.recording import NothingToLearnFrom, open_recording
 from magmav.settings import Settings
 
@@ -41,8 +44,9 @@ def truth_of(path: Path) -> Path | None:
 def rows(path: Path, names: list[str]) -> list[list[str]]:
     """A line per compass."""
     truth = truth_of(path)
-    recording = open_recording(path)
+    recording = None
     try:
+        recording = open_recording(path)
         side = compare(
             recording,
             Settings(),
@@ -52,10 +56,11 @@ def rows(path: Path, names: list[str]) -> list[list[str]]:
             only=names,
         )
         fit = magmav.fit(path, options=magmav.FitOptions(heading_reference=None if truth is None else str(truth)))
-    except NothingToLearnFrom as error:
+    except (NothingToLearnFrom, LinkError, LogError) as error:
         return [[path.name, "-", str(error).partition(": ")[2][:60]]]
     finally:
-        recording.close()
+        if recording is not None:
+            recording.close()
     fits = {(v["system"], c["compass"]): c for v in fit["vehicles"] for c in v["compasses"]}
     out = []
     for vehicle in side["vehicles"]:
@@ -92,6 +97,15 @@ def degrees(score: dict[str, Any] | None) -> str:
     return "-" if not score or score.get("rms_deg") is None else f"{score['rms_deg']:.1f}"
 
 
+def placed(page: str, lines: list[str]) -> str:
+    """The page with these lines between its marks. SystemExit where it has none."""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise SystemExit(f"the page wants the lines {BEGIN} and {END}: the table is put between them")
+    return before + "\n".join([BEGIN, *lines, END]) + after
+
+
 def main(argv: list[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -99,20 +113,27 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--files", default="", metavar="PART,...", help="recordings whose name contains one of these")
     parser.add_argument("--write", type=Path, metavar="PAGE", help="put the table into this page")
     o = parser.parse_args(argv)
-    names = o.only.split(",")
+    names, files = o.only.split(","), recordings([p for p in o.files.split(",") if p])
+    if not files:
+        print(f"{DATA}: no such recordings; set MAGMAV_DATA", file=sys.stderr)
+        return 3
+    if unknown := set(names) - set(METHODS):
+        parser.error(f"--only: no such method: {', '.join(sorted(unknown))}")
+    if o.write is not None:
+        placed(o.write.read_text(encoding="utf-8"), [])  # said before an hour of work, not after
     head = ["recording", "compass", "reference", "uncalibrated", "stored", *names]
     head += ["fit, held out", "fit, whole flight", "offsets or change of fit, mG", "state of fit"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     print("\n".join(lines), flush=True)
-    for path in recordings([p for p in o.files.split(",") if p]):
+    for path in files:
         for cells in rows(path, names):
             lines.append("| " + " | ".join(cells + [""] * (len(head) - len(cells))) + " |")
             print(lines[-1], flush=True)
     if o.write is not None:
-        page = o.write.read_text(encoding="utf-8")
-        before, _, rest = page.partition(BEGIN)
-        _, _, after = rest.partition(END)
-        o.write.write_text(f"{before}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{after}", encoding="utf-8")
+        page = placed(o.write.read_text(encoding="utf-8"), lines)
+        part = o.write.with_name(f"{o.write.name}.part")
+        part.write_text(page, encoding="utf-8")
+        part.replace(o.write)
     return 0
 
 
