@@ -230,7 +230,7 @@ def compare(
     def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
         kept.setdefault((sample.system, sample.compass), Tape()).add(sample, circumstances, stretch)
 
-    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, learns=False)
+    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, idle=True)
     keeper = Keeper(pipeline, None)
     progress(f"{source}: reading")
     play(recording, pipeline, [keeper])

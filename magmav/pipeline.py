@@ -18,22 +18,14 @@ from magmav.vehicle import Tap, Vehicle
 class Pipeline:
     """Every vehicle on a link. ``unix_offset_ns`` takes arrival time to UNIX time, for the field model's date.
 
-    tap : sees every Sample before it is learnt from, see vehicle.Tap.  learns : False where that is all.
+    tap : sees every Sample before it is learnt from, see vehicle.Tap.  idle : that is all.
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        model: FieldModel,
-        unix_offset_ns: int = 0,
-        tap: Tap | None = None,
-        learns: bool = True,
+        self, settings: Settings, model: FieldModel, unix_offset_ns: int = 0, tap: Tap | None = None, idle: bool = False
     ) -> None:
-        self.settings = settings
-        self._tap = tap
-        self._learns = learns
-        self._model = model
-        self._unix_offset_ns = unix_offset_ns
+        self.settings, self._model = settings, model
+        self._tap, self._idle, self._unix_offset_ns = tap, idle, unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
         self._own: dict[int, Settings] = {}
         # Their libraries take seconds to load: now, not at the first sample.
@@ -59,5 +51,5 @@ class Pipeline:
         vehicle, system = self.vehicles.get(reading.system), reading.system
         if vehicle is None:
             settings = self._own.get(system, self.settings)
-            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap, self._learns)
+            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap, self._idle)
         return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)

@@ -150,17 +150,17 @@ def replay(
     stop: Callable[[], bool] = lambda: False,
     tap: Tap | None = None,
     boots: dict[int, Vehicle | Boot] | None = None,
-    learns: bool = True,
+    idle: bool = False,
 ) -> Result:
     """Run a recording to its end; the result is the JSON document that ``magmav replay --json`` prints.
 
     references : filled with what each system was scored against, for pictures.  tap : see vehicle.Tap.
-    boots : filled with each system's boot that the result is about.  learns : see Pipeline.
+    boots : filled with each system's boot that the result is about.  idle : see Pipeline.
     Raises NothingToLearnFrom when no compass was heard, TruthError for a bad reference file.
     """
     truth = None if reference_csv is None else Reference.from_csv(reference_csv)
     source = recording.name if source is None else source
-    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, learns)
+    pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, idle)
     keeper = Keeper(pipeline, learn_for_s)
     play(recording, pipeline, (keeper, *watchers), stop)
     earlier = keeper.bring_back()

@@ -78,19 +78,14 @@ class Boot:
 
 
 class Vehicle:
-    """One vehicle: what it says of itself, and one channel per compass.
-
-    learns : False where only the Samples are wanted, which ``tap`` sees.
-    """
+    """One vehicle: what it says of itself, and one channel per compass. idle : only ``tap`` wants its Samples."""
 
     def __init__(
-        self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None, learns: bool = True
+        self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None, idle: bool = False
     ) -> None:
-        self.system = system
-        self._tap = tap
-        self._learns = learns
-        self.settings = settings
-        self.autopilot = 0
+        self.system, self.settings = system, settings
+        self._tap, self._idle = tap, idle
+        self.autopilot = self._reboots = 0
         self.learning = settings.learn.on
         self.learn_for_s: float | None = None
         self.assembler = Assembler(system, settings.attitude.own)
@@ -110,7 +105,6 @@ class Vehicle:
         self._publishers: dict[int, Publisher] = {}
         self._first_ns: int | None = None
         self._throttle: float | None = None
-        self._reboots = 0
         if not math.isnan(settings.place.lat_deg):
             self._place = (settings.place.lat_deg, settings.place.lon_deg, settings.place.alt_m)
 
@@ -217,7 +211,7 @@ class Vehicle:
             self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
         finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
-        if self._learns:
+        if not self._idle:
             self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
         finding = self._doubted(finding, held.refuses(compass) or self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
@@ -326,7 +320,7 @@ class Vehicle:
 
     def _channel(self, compass: int) -> Channel:
         if compass not in self.channels:
-            self.channels[compass] = new_channel(self.settings, make=None if self._learns else Idle)
+            self.channels[compass] = new_channel(self.settings, make=Idle if self._idle else None)
         return self.channels[compass]
 
     def settle(self, compass: int) -> None:

@@ -38,7 +38,7 @@ IRON_MG = ((180.0, -120.0, 240.0), (-150.0, 90.0, -200.0))
         (["figure8", "--reference", "no_such.csv"], 2, "figure8"),
         (["no_such.tlog", "--seed", "3"], 2, "--seed"),
         (["nodir/figure8"], 3, "nodir"),
-        (["figure8", "--plot", "c.jpg", "--only", "kasa"], 3, "c.jpg"),
+        (["figure8", "--plot", "c.jpg", "--only", "kasa"], 2, "c.jpg"),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_name(words, code, says, capsys):

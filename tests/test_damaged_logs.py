@@ -15,8 +15,6 @@ from damaged_logs import COMMANDS, KINDS, cut, flipped, flown, judged, read
 
 from magmav.cli import main
 
-pytestmark = pytest.mark.long  # until a fit is fast
-
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:

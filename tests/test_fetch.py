@@ -56,15 +56,26 @@ def test_each_name_is_read_once_ten_a_second() -> None:
 
 
 def test_silence_means_absent_after_four_requests_with_ever_rarer_chances_after_that() -> None:
-    bench = Bench(["COMPASS_X", "COMPASS_Y"], {"COMPASS_Y"})
+    bench = Bench(["COMPASS_SCALE", "COMPASS_MOTCT"], {"COMPASS_MOTCT"})
     bench.run(6.0)
-    assert [t for t, n in bench.asked if n == "COMPASS_X"] == pytest.approx([0, 1, 2, 3], abs=0.15)
-    assert bench.fetch.absent == {"COMPASS_X"} and bench.fetch.done
+    assert [t for t, n in bench.asked if n == "COMPASS_SCALE"] == pytest.approx([0, 1, 2, 3], abs=0.15)
+    assert bench.fetch.absent == {"COMPASS_SCALE"} and bench.fetch.done
     bench.run(240.0)
-    times = [t for t, n in bench.asked if n == "COMPASS_X"]
+    times = [t for t, n in bench.asked if n == "COMPASS_SCALE"]
     assert [b - a for a, b in pairwise(times[3:])] == pytest.approx([6.0, 10.0, 20.0, 40.0, 80.0], abs=0.2)
-    bench.value("COMPASS_X")  # it was the link after all
-    assert bench.fetch.absent == frozenset() and bench.fetch.heard == {"COMPASS_X", "COMPASS_Y"}
+    bench.value("COMPASS_SCALE")  # it was the link after all
+    assert bench.fetch.absent == frozenset() and bench.fetch.heard == {"COMPASS_SCALE", "COMPASS_MOTCT"}
+
+
+def test_who_has_one_of_three_axes_has_the_others_and_silence_was_the_links() -> None:
+    bench = Bench(["COMPASS_OFS_X", "COMPASS_OFS_Y", "COMPASS_MOTCT"], {"COMPASS_OFS_Y"})
+    bench.run(20.0)
+    asked = [t for t, name in bench.asked if name == "COMPASS_OFS_X"]
+    assert max(b - a for a, b in pairwise(asked)) < 2.2 and len(asked) >= 10
+    assert bench.fetch.absent == {"COMPASS_MOTCT"}
+    bench.run(40.0)  # sixteen times are enough for any link that carries anything
+    assert bench.fetch.absent == {"COMPASS_MOTCT", "COMPASS_OFS_X"} and bench.fetch.done
+    assert len([t for t, name in bench.asked if name == "COMPASS_OFS_X"]) < 22
 
 
 def test_an_error_means_absent_at_once() -> None:

@@ -41,8 +41,6 @@ ROW = Learnt(
 )  # fmt: skip
 DAY_NS = 86_400 * 10**9
 
-pytestmark = pytest.mark.long  # until a fit is fast
-
 
 # ------------------------------------------------------------ the store
 

@@ -29,8 +29,6 @@ FILES = ("fits.json", "fits.csv", "fits.html")
 KEY = work_key(Settings(), FitOptions())
 WALL_S = 300.0
 
-pytestmark = pytest.mark.long  # until a fit is fast
-
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -161,7 +159,6 @@ def test_a_run_killed_at_random_moments_goes_on_and_ends_with_the_same_bytes(
     assert 0 < len(seen[2]) < len(seen[3]), "the kills came in the middle"
 
 
-@pytest.mark.long
 def test_a_worker_that_is_killed_costs_its_log_one_more_turn_and_no_other_anything(
     undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +181,6 @@ def test_a_worker_that_is_killed_costs_its_log_one_more_turn_and_no_other_anythi
     assert got["vehicles"] == was["vehicles"] and len(lines(out / "ledger.jsonl")) == 1
 
 
-@pytest.mark.long
 def test_a_log_that_kills_its_worker_every_time_is_refused_by_name_and_tried_again_next_time(
     undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

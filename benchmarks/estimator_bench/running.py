@@ -17,7 +17,7 @@ from magmav.core.field import ExpectedField
 from magmav.core.types import Estimate, Sample, State
 from magmav.geomag import world_magnetic_model
 from magmav.pipeline import Pipeline
-from magmav.settings import Settings, with_value
+from magmav.settings import Settings
 from magmav.vehicle import new_channel
 
 TICK_S = 0.2
@@ -61,8 +61,7 @@ def tape(flight: Flight, settings: Settings | None = None) -> list[Heard]:
     def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
         out.append(Heard(sample.boot_ns / 1e9 - BOOT_S, sample, circumstances))
 
-    cheapest = with_value(settings or Settings(), "learn", "estimator", "minmax")  # Samples do not depend on it
-    pipeline = Pipeline(cheapest, world_magnetic_model, UNIX_AT_BOOT_NS, tap)
+    pipeline = Pipeline(settings or Settings(), world_magnetic_model, UNIX_AT_BOOT_NS, tap, idle=True)
     for t_ns, reading in flight.readings:
         pipeline.step(reading, t_ns)
     return out

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from magmav.appraisal import CompassLog
 from magmav.core.channel import Circumstances
-from magmav.core.estimators import ESTIMATORS
-from magmav.core.field import ExpectedField
-from magmav.core.types import CurrentReading, Estimate, Reading, Record, Sample, ThrottleReading, Vec3
+from magmav.core.types import CurrentReading, Reading, Record, Sample, ThrottleReading, Vec3
 from magmav.geomag import world_magnetic_model
 from magmav.logs import Recording
 from magmav.pipeline import Pipeline
 from magmav.recording import Keeper, open_recording, play
 from magmav.reference import Reference
-from magmav.settings import Settings, with_value
+from magmav.settings import Settings
 from magmav.vehicle import Boot, Vehicle
 
 DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -74,27 +71,6 @@ def recordings(folder: Path = DATA) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.suffix in (".tlog", ".bin", ".ulg"))
 
 
-class _Idle:
-    """Learns nothing, at no cost. Satisfies Estimator."""
-
-    def step(self, sample: Sample) -> None:
-        """Nothing."""
-
-    def estimate(self, expected: ExpectedField | None) -> Estimate | None:
-        """Nothing."""
-        return None
-
-
-@contextmanager
-def _nobody_learns(settings: Settings) -> Iterator[Settings]:
-    """The same settings with an estimator that does nothing: Samples do not depend on what is learnt from them."""
-    ESTIMATORS["idle"] = _Idle
-    try:
-        yield with_value(settings, "learn", "estimator", "idle")
-    finally:
-        del ESTIMATORS["idle"]
-
-
 def tapes(recording: Recording, name: str, settings: Settings | None = None) -> list[Tape]:
     """One tape per vehicle that was heard."""
     settings = settings or Settings()
@@ -110,10 +86,9 @@ def tapes(recording: Recording, name: str, settings: Settings | None = None) -> 
         elif tapped and record is not None:
             events.setdefault(reading.system, []).append(Heard(*tapped.pop(), record.stored_b_mg))
 
-    with _nobody_learns(settings) as idle:
-        pipeline = Pipeline(idle, world_magnetic_model, recording.unix_offset_ns, tap)
-        keeper = Keeper(pipeline, None)
-        play(recording, pipeline, [keeper, keep])
+    pipeline = Pipeline(settings, world_magnetic_model, recording.unix_offset_ns, tap, idle=True)
+    keeper = Keeper(pipeline, None)
+    play(recording, pipeline, [keeper, keep])
     earlier = keeper.bring_back()
     out = []
     for system in sorted({s for s, _ in keeper.compasses}):

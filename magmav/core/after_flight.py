@@ -19,8 +19,7 @@ import copy
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +32,10 @@ from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.tuning import Tuning
-from magmav.core.rotation import TAU, body_from_earth
+from magmav.core.rotation import TAU
+from magmav.core.stretch import backwards, flown, framed
 from magmav.core.two_filter import noted, product
-from magmav.core.types import Estimate, Sample, mat3
+from magmav.core.types import Estimate, Sample
 
 _EVERY_NS = 1_000_000_000
 _MOMENTS = 600  # at most about so many: between them the iron is a straight line
@@ -91,62 +91,18 @@ def after_flight(
     samples : as the estimator was given them, in order of time; of one boot, undone with one set of stored values.
     until_ns : boot time of ``foretold``.
     """
-    flown = _framed(_flown(samples))
-    if not flown:
+    stretch = framed(flown(samples))
+    if not stretch:
         return None
-    run = _BothWays(flown, tuning, until_ns=until_ns)
+    run = _BothWays(stretch, tuning, until_ns=until_ns)
     foretold, changes = run.foretold, run.changes()
     if changes or run.startled:
-        run = _BothWays(flown, tuning, changes, run.middle_ns)
+        run = _BothWays(stretch, tuning, changes, run.middle_ns)
     known = [(t, e) for t, e in run.estimates() if e is not None]
     if not known:
         return None
     times = np.array([t for t, _ in known], dtype=np.int64)
     return AfterFlight(times, tuple(e for _, e in known), tuple(sorted(t for t in changes if t > times[0])), foretold)
-
-
-# ---------------------------------------------------------------- samples, and time turned round
-
-
-def _flown(samples: Sequence[Sample]) -> list[Sample]:
-    """The last stretch that taught and was not in somebody's hands; all that taught where nothing flew."""
-    in_hands = False
-    runs: list[tuple[bool, list[Sample]]] = []
-
-    def hands(s: Sample) -> bool:
-        nonlocal in_hands
-        in_hands = s.by_hand if s.learn else in_hands  # what does not teach belongs to what came before
-        return in_hands
-
-    runs = [(held, list(run)) for held, run in groupby(samples, key=hands)]
-    taught = [(held, run) for held, run in runs if any(s.learn for s in run)]
-    if not taught:
-        return []
-    aloft = [run for held, run in taught if not held]
-    return (aloft or [run for _, run in taught])[-1]
-
-
-def _framed(samples: Sequence[Sample]) -> list[Sample]:
-    """Each with its own frame, so that no yaw need be summed; and the field known from the first on."""
-    model_mg = next((s.model_mg for s in samples if s.learn and s.model_mg is not None), None)
-    out: list[Sample] = []
-    yaw = 0.0
-    for s in samples:
-        yaw += s.yaw_step_rad
-        if s.body_from_own is None:
-            frame = mat3(body_from_earth(s.roll_rad, s.pitch_rad, yaw), "own frame")
-            s = replace(s, body_from_own=frame)
-        out.append(s if s.model_mg is not None or model_mg is None else replace(s, model_mg=model_mg))
-    return out
-
-
-def backwards(samples: Sequence[Sample]) -> list[Sample]:
-    """The same with time turned round. Twice turned, all but the first's step and gap are as they were."""
-    if not samples:
-        return []
-    last = replace(samples[-1], dt_s=0.0, yaw_step_rad=0.0, gap=False)
-    rest = zip(reversed(samples[:-1]), reversed(samples[1:]), strict=True)
-    return [last, *(replace(s, dt_s=n.dt_s, yaw_step_rad=-n.yaw_step_rad, gap=n.gap) for s, n in rest)]
 
 
 # ---------------------------------------------------------------- one way

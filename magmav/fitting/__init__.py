@@ -77,7 +77,7 @@ def fit(
             references=references,
             tap=recorder.tap,
             boots=boots,
-            learns=False,
+            idle=True,
         )
     finally:
         recording.close()

@@ -3,6 +3,7 @@
 ArduPilot 4.5 says nothing about a name it does not have, newer ones send PARAM_ERROR. Silence after four
 requests means absent, with late chances ever further apart, since silence may also have been the link: with 30 %
 loss each way, one name in fifteen gets no answer to four requests, and without its offsets a compass stays unusable.
+Who answered for one of three axes has the other two: for those, silence was the link's.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ RETRY_NS = _SECOND
 TRIES = 4
 LATE_NS = 5 * _SECOND  # after that twice as long, and so on
 LAST_PAUSE_NS = 480 * _SECOND
+KIN_PAUSE_NS, KIN_TRIES = 2 * _SECOND, 16
 
 
 @dataclass(slots=True)
@@ -113,14 +115,15 @@ class ParamFetch:
         for name, state in self._state.items():
             if state.heard or state.denied or now_ns < state.due_ns:
                 continue
-            if state.tries == TRIES and not state.absent:
+            kin = TRIES <= state.tries < KIN_TRIES and self._has_kin(name)
+            if state.tries >= TRIES and not state.absent and not kin:
                 state.absent, state.due_ns = True, now_ns + LATE_NS
                 continue
             if not self._room(now_ns):
                 return []
             state.tries += 1
             late = state.tries - TRIES
-            pause_ns = RETRY_NS if late <= 0 else min(LATE_NS << late, LAST_PAUSE_NS)
+            pause_ns = RETRY_NS if late <= 0 else KIN_PAUSE_NS if kin else min(LATE_NS << late, LAST_PAUSE_NS)
             state.due_ns = now_ns + pause_ns
             self._next_ns = now_ns + SPACING_NS
             message = dialect.MAVLink_param_request_read_message(
@@ -128,3 +131,9 @@ class ParamFetch:
             )
             return [Outgoing(message, autopilot.route)]
         return []
+
+    def _has_kin(self, name: str) -> bool:
+        """Has the vehicle answered for another axis of the same three?"""
+        return name[-1] in "XYZ" and any(
+            state.heard for other, state in self._state.items() if other[:-1] == name[:-1] and other[-1] in "XYZ"
+        )
