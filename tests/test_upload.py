@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -653,6 +654,36 @@ def test_AT_8b_a_float32_is_compared_as_one_and_its_neighbour_is_another_value()
     near = float(np.nextafter(np.float32(OLD[0]), np.float32(99.0)))
     rig.vehicle.params["COMPASS_OFS_X"] = near
     assert rig.go().reasons == (Reason.OFFSETS_CHANGED,)
+
+
+class Contrary(Vehicle):
+    """An ArduPilot that puts an integer's own bytes where the float is, and may say so (AUTOPILOT_VERSION)."""
+
+    def _value_out(self, name: str) -> Any:
+        if name not in ("COMPASS_DEV_ID", "COMPASS_LEARN"):
+            return super()._value_out(name)
+        (bits,) = struct.unpack("<f", struct.pack("<i", int(self.params[name])))
+        return dialect.MAVLink_param_value_message(name.encode(), bits, 6, 1000, 40)
+
+
+class ContraryRig(Rig):
+    make = Contrary
+
+
+@pytest.mark.parametrize("says", [16, 131072, 0, 16 | 131072])
+@pytest.mark.parametrize("route", ["", "udp:2"])
+def test_AT_8b_what_the_vehicle_says_of_its_encoding_counts_for_a_write_too(says: int, route: str) -> None:
+    """An integer is read as the vehicle says, over its own route; else as its kind does, which here is wrong."""
+    rig = ContraryRig()
+    version = dialect.MAVLink_autopilot_version_message(says, 0, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0)
+    rig.vehicle.say(version, route)
+    rig.vehicle.run(None, 15.0, rig.feed)  # and what comes over a second route is long past
+    upload = rig.go()
+    if says == 16 and not route:
+        assert (upload.result, upload.reasons) == (UploadResult.ALL_NEW, ())
+    else:
+        assert (upload.result, upload.reasons) == (UploadResult.REFUSED, (Reason.DEVICE_CHANGED,))
+        assert not rig.vehicle.sets
 
 
 def test_S20_after_a_write_there_is_advice_before_take_off_and_after_none_there_is_none() -> None:

@@ -30,12 +30,11 @@ from magmav.core.types import (
     vec3,
 )
 from magmav.mavlink.codec import Message
-from magmav.mavlink.values import bytewise, cast
+from magmav.mavlink.values import bytewise, cast, says_bytewise
 
 G = 9.80665
 MS, US = 1_000_000, 1_000
 _PX4, _NO_AUTOPILOT = 12, 8  # MAV_AUTOPILOT_PX4, MAV_AUTOPILOT_INVALID
-_SAYS_BYTEWISE, _SAYS_CAST = 16, 131072  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE and _C_CAST
 _ONLY_PX4 = ("CAL_", "SENS_")  # names that tell whose they are before a heartbeat does
 EPOCH_US = 10**14  # three years since boot: such a time is UNIX time, not a boot clock
 # No gyro measures over 70 rad/s and no attitude lies beyond a turn: what does is damage, and would poison a filter.
@@ -240,9 +239,9 @@ class Decoder:
         return name.startswith(_ONLY_PX4) if kind is None else kind == _PX4
 
     def _version(self, m: Message, system: int) -> list[Reading]:
-        says_bytes, says_cast = bool(m.capabilities & _SAYS_BYTEWISE), bool(m.capabilities & _SAYS_CAST)
-        if says_bytes != says_cast:
-            self._bytewise[system] = says_bytes
+        says = says_bytewise(m.capabilities)
+        if says is not None:
+            self._bytewise[system] = says
         return []
 
     def _report(self, m: Message, system: int) -> list[Reading]:

@@ -10,6 +10,7 @@ from magmav.mavlink.autopilot.adapter import Adapter
 from magmav.mavlink.codec import Message, Outgoing
 from magmav.mavlink.exchange import Exchange
 from magmav.mavlink.float32 import same
+from magmav.mavlink.values import bytewise, cast
 
 
 class Dialogue:
@@ -35,10 +36,14 @@ class Dialogue:
         """From now on these names are open."""
         self.asking = Exchange(names, retry_ns, tries)
 
-    def heard(self, message: Message, wanted: Mapping[str, float] | None) -> None:
-        """Take a PARAM_VALUE. A name is answered by any value, or with ``wanted`` only by the one that is wanted."""
+    def heard(self, message: Message, wanted: Mapping[str, float] | None, by_bytes: bool | None = None) -> None:
+        """Take a PARAM_VALUE. A name is answered by any value, or with ``wanted`` only by the one that is wanted.
+
+        by_bytes : how the vehicle says that it encodes integers, before what its kind is known for (AT-8b).
+        """
         name = message.param_id
-        value = self._adapter.value_of(message) if name in self._names else None
+        read = self._adapter.value_of if by_bytes is None else bytewise if by_bytes else cast
+        value = read(message) if name in self._names else None
         if value is None:
             return
         self.stored[name] = value

@@ -162,7 +162,8 @@ class Upload:
                 self._arming_check.on_message(message, now_ns)
             elif kind == "PARAM_VALUE":
                 asking = self.phase in (Phase.PREFLIGHT, Phase.READ_BACK)
-                self._talk.heard(message, None if asking else self._target if self.phase is Phase.WRITE else {})
+                wanted = None if asking else self._target if self.phase is Phase.WRITE else {}
+                self._talk.heard(message, wanted, self._watch.bytewise)
             elif kind == "PARAM_ERROR" and message.param_id in self._talk.asking.open:
                 if self.phase is Phase.PREFLIGHT and message.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST:
                     self._end(UploadResult.REFUSED, Reason.UNKNOWN_PARAM)

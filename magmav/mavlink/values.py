@@ -36,6 +36,13 @@ def payload_bytes(message: Message) -> bytes:
     return bytes(frame[at : at + min(4, frame[1])]).ljust(4, b"\0")  # first in both; MAVLink 2 cuts zeros off the end
 
 
+def says_bytewise(capabilities: int) -> bool | None:
+    """How a vehicle says in AUTOPILOT_VERSION that it encodes; None where it says neither or both."""
+    bytes_too = bool(capabilities & dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
+    casts = bool(capabilities & dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST)
+    return None if bytes_too == casts else bytes_too
+
+
 def cast(message: Message) -> float | None:
     """A number sent as a float whatever its type is. None when it is not finite."""
     value = float(message.param_value)

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from magmav.core.types import Landed
 from magmav.mavlink.codec import Message
 from magmav.mavlink.presence import Presence
+from magmav.mavlink.values import says_bytewise
 
 _SECOND = 1_000_000_000
 STILL_RADS = 0.05  # a gyro at rest stays under 0.02; a vehicle that is carried does not
@@ -30,12 +31,13 @@ class Watch:
 
     heartbeat_ns, disarmed : the last heartbeat over the pinned route.  heard_ns : the last message of any
     kind.
-    since_ns : when watching this very autopilot began.
+    since_ns : when watching this very autopilot began.  bytewise : how it says that it encodes integers, if it does.
     """
 
     def __init__(self, presence: Presence) -> None:
         self.presence = presence
         self._pin: tuple[int, int, str, int] | None = None
+        self.bytewise: bool | None = None
         self._forget()
 
     def _forget(self) -> None:
@@ -58,6 +60,8 @@ class Watch:
             return
         pin = (*autopilot.pin, self.presence.boots)  # what was seen before a reboot says nothing of after it
         if self._pin != pin:
+            if self._pin is None or self._pin[:3] != pin[:3]:
+                self.bytewise = None
             self._pin = pin
             self._forget()
         kind = message.get_type()
@@ -74,6 +78,8 @@ class Watch:
             self.heartbeat_ns, self.disarmed = now_ns, not armed
         elif kind == "EXTENDED_SYS_STATE":
             self._landed = message.landed_state, now_ns
+        elif kind == "AUTOPILOT_VERSION":
+            self.bytewise = says_bytewise(message.capabilities)
         elif kind == "MAG_CAL_PROGRESS":
             self._calibrating_ns = now_ns
         elif kind == "GLOBAL_POSITION_INT":
