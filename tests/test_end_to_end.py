@@ -45,7 +45,7 @@ def field_day(folder):
 def until_landed_and_ready(run):
     """Lines of `magmav run` until compass 1 is ready and the vehicle has stood still in heading for a while."""
     seen, begun = [], time.monotonic()
-    while time.monotonic() - begun < 90.0:
+    while time.monotonic() - begun < 300.0:
         seen.append(json.loads(run.stdout.readline()))
         recent = [r for r in seen[-3:] if r["state"] == "READY"]
         if len(recent) == 3 and seen[-1]["boot_s"] > 80.0 and recent[0]["offsets_mg"] == seen[-1]["offsets_mg"]:

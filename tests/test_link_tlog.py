@@ -340,9 +340,9 @@ def test_a_real_flight_decodes_without_a_single_bad_checksum() -> None:
     path = FLIGHTS / "thor75.tlog"
     if not path.exists():
         pytest.skip(f"real recordings not found at {FLIGHTS}; set MAGMAV_DATA")
-    began = time.perf_counter()
+    began = time.process_time()
     packets, link = read(path)
-    took_s = time.perf_counter() - began
+    took_s = time.process_time() - began
     codec = Codec()
     for packet in packets:
         assert len(codec.decode(packet.data, packet.route, whole=True)) == 1

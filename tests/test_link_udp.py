@@ -29,8 +29,8 @@ def peers() -> Iterator[list[socket.socket]]:
 
 
 def some(link: UdpLink, count: int) -> list[Packet]:
-    """The next packets that carry bytes, within two seconds."""
-    end = time.monotonic() + 2.0
+    """The next packets that carry bytes; a minute is for those that never come, however busy the machine is."""
+    end = time.monotonic() + 60.0
     in_time = itertools.takewhile(lambda _: time.monotonic() < end, link.packets())
     return list(itertools.islice((p for p in in_time if p.data), count))
 
@@ -57,7 +57,7 @@ def test_one_datagram_is_one_packet_and_each_peer_has_its_route(peers: list[sock
         ]
         assert [p.t_ns for p in got] == sorted(p.t_ns for p in got)
         unix_ns = got[-1].t_ns + link.unix_offset_ns
-        assert abs(unix_ns - time.time_ns()) < 2_000_000_000
+        assert abs(unix_ns - time.time_ns()) < 60_000_000_000  # not the day in which the machine was started
 
 
 def test_sending_goes_to_one_route_or_to_all(peers: list[socket.socket]) -> None:
@@ -159,7 +159,7 @@ def test_a_quiet_link_ticks_and_empty_datagrams_are_no_data(peers: list[socket.s
     with closing(udp_in("", 0, tick_s=0.01)) as link:
         began = time.monotonic()
         ticks = list(itertools.islice(link.packets(), 5))
-        assert 0.045 < time.monotonic() - began < 1.0
+        assert time.monotonic() - began > 0.045
         assert all(p.data == b"" and p.route == "" for p in ticks)
         peers[0].sendto(b"", ("127.0.0.1", link.port))
         assert next(link.packets()).data == b"" and link.counts["empty datagrams"] == 1
@@ -194,13 +194,13 @@ def test_ipv6_peers_have_routes_in_brackets() -> None:
 
 
 def test_closing_from_a_signal_handler_ends_the_packets() -> None:
-    link = udp_in("", 0, tick_s=5.0)  # the signal comes in the middle of the wait
+    link = udp_in("", 0, tick_s=120.0)  # the signal comes in the middle of the wait
     before = signal.signal(signal.SIGALRM, lambda *_: link.close())
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.05)
         began = time.monotonic()
         assert list(link.packets()) == []
-        assert time.monotonic() - began < 2.0
+        assert time.monotonic() - began < 60.0
     finally:
         signal.signal(signal.SIGALRM, before)
     link.close()
