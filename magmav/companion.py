@@ -241,6 +241,7 @@ class MagCompanion:
     def poll(self, now_ns: int) -> list[Outgoing]:
         """What is due from every machine, the write under way first."""
         self._now_ns = now_ns
+        self._watch.tick(now_ns)
         if self.presence.ambiguous and not self._said_ambiguous:
             self._said_ambiguous = True
             _log.warning("several vehicles %s; choose one with --system ID", self.presence.ambiguous)

@@ -330,6 +330,40 @@ def test_S1_nothing_is_called_done_before_a_heartbeat_that_left_after_the_last_w
     assert (upload.result, upload.reasons) == (UploadResult.PENDING_RESTORE, (Reason.LINK_LOST,))
 
 
+@pytest.mark.parametrize("took_s", [0.8, 1.3, 3.0, 9.0])
+def test_S1_a_disk_that_takes_seconds_makes_no_old_heartbeat_fresh(took_s: float) -> None:
+    """While the record is written nothing is read. What waited meanwhile says disarmed; the vehicle has armed since."""
+    rig = Rig()
+    vehicle, begin = rig.vehicle, rig.journal.begin
+
+    def slow(*args: Any) -> int:
+        row = begin(*args)
+        for _ in range(3):
+            vehicle.say(vehicle.heartbeat(False))
+        vehicle.armed, vehicle.now_ns = True, vehicle.now_ns + round(took_s * S)
+        return row
+
+    rig.journal.begin = slow  # type: ignore[method-assign]
+    upload = rig.go()
+    assert (upload.result, vehicle.sets) == (UploadResult.REFUSED, [])
+    assert rig.stored() == OLD
+
+
+@pytest.mark.parametrize("took_s", [0.4, 0.8, 3.0])
+def test_a_disk_that_takes_seconds_only_delays(took_s: float) -> None:
+    rig = Rig()
+    vehicle, begin = rig.vehicle, rig.journal.begin
+
+    def slow(*args: Any) -> int:
+        row = begin(*args)
+        vehicle.now_ns += round(took_s * S)
+        return row
+
+    rig.journal.begin = slow  # type: ignore[method-assign]
+    assert rig.go().result is UploadResult.ALL_NEW
+    rig.check_S1()
+
+
 def test_S3_armed_between_write_one_and_two_stops_and_says_so() -> None:
     rig = Rig()
     vehicle = rig.vehicle

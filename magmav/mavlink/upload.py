@@ -177,6 +177,7 @@ class Upload:
         """Do what is due now."""
         if self.phase in (Phase.IDLE, Phase.DONE):
             return []
+        self._watch.tick(now_ns)
         why = [] if self.phase is Phase.ARMING else self._interruption(now_ns)
         if why:
             self._stop(*why)
@@ -247,7 +248,7 @@ class Upload:
         except OSError:
             self._end(UploadResult.REFUSED, Reason.NOT_RECORDED)
         else:
-            self._enter(Phase.WRITE, now_ns)
+            self._enter(Phase.WRITE, now_ns, at_once=False)  # the disk may have taken long: first look at the time
 
     def _write(self, now_ns: int) -> None:
         if not self._talk.asking.open or self._talk.asking.spent(now_ns):
@@ -312,7 +313,7 @@ class Upload:
 
     # ------------------------------------------------------------ moving between them
 
-    def _enter(self, phase: Phase, now_ns: int) -> None:
+    def _enter(self, phase: Phase, now_ns: int, *, at_once: bool = True) -> None:
         """The one place where the phase changes, but for the end."""
         self.phase, self._since_ns = phase, now_ns
         measuring = phase in (Phase.BASELINE, Phase.PROOF)
@@ -323,7 +324,7 @@ class Upload:
             self._talk.turn_to(todo, self._set.retry_ns, self._set.write_tries)
         elif phase is Phase.READ_BACK:
             self._talk.turn_to(self._target, self._set.retry_ns, self._set.read_tries)
-        if phase is not Phase.PREFLIGHT:
+        if at_once and phase is not Phase.PREFLIGHT:
             self._steps[phase](now_ns)
 
     def _retreat(self, why: Reason, now_ns: int) -> None:

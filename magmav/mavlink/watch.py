@@ -23,6 +23,7 @@ _GAP_NS = 3 * _SECOND  # silence longer than this proves nothing about the time 
 _LANDED_NS = 5 * _SECOND
 _CALIBRATING_NS = 10 * _SECOND
 _ARMED_NS = 5 * _SECOND
+_STALL_NS = _SECOND // 2  # ticks come every 0.05 s: after so long a pause of ours, what comes next has waited
 _IMU = ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 
@@ -38,6 +39,8 @@ class Watch:
         self.presence = presence
         self._pin: tuple[int, int, str, int] | None = None
         self.bytewise: bool | None = None
+        self._looked_ns: int | None = None
+        self._drained_ns = 0
         self._forget()
 
     def _forget(self) -> None:
@@ -53,8 +56,17 @@ class Watch:
         self._still_since_ns: int | None = None
         self._calibrating_ns: int | None = None
 
+    def tick(self, now_ns: int) -> None:
+        """Call it often. Where we ourselves stood still (a slow disk, a sleeping machine), messages waited meanwhile:
+        until they are through, none that says disarmed is fresh (S1)."""
+        paused_ns = 0 if self._looked_ns is None else now_ns - self._looked_ns
+        if paused_ns > _STALL_NS:
+            self._drained_ns = now_ns + _STALL_NS + min(paused_ns * 3 // 10, 5 * _SECOND)
+        self._looked_ns = now_ns
+
     def on_message(self, message: Message, route: str, now_ns: int) -> None:
         """Note one message. Being told twice does no harm."""
+        self.tick(now_ns)
         autopilot = self.presence.autopilot
         if autopilot is None:
             return
@@ -75,7 +87,8 @@ class Watch:
         self.since_ns = now_ns if self.since_ns is None else self.since_ns
         self.heard_ns = now_ns
         if kind == "HEARTBEAT":
-            self.heartbeat_ns, self.disarmed = now_ns, not armed
+            if armed or now_ns >= self._drained_ns:
+                self.heartbeat_ns, self.disarmed = now_ns, not armed
         elif kind == "EXTENDED_SYS_STATE":
             self._landed = message.landed_state, now_ns
         elif kind == "AUTOPILOT_VERSION":
