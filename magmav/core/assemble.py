@@ -204,6 +204,7 @@ class Assembler:
             gap=gap,
             tilt_from=state.source,
             own_tilt_rad=state.own_tilt_rad,
+            tilt_every_s=state.every_s,
             learn=learn,
             axes=axes,
             model_mg=model_mg,

@@ -47,6 +47,7 @@ class MotionState(NamedTuple):
     bridged: bool  # the yaw step over a long gap is still good
     own_frame: Frame  # level with the earth, carried along by the gyro; good at every attitude
     own_tilt_rad: float = 0.0  # sigma about each level axis of a tilt that is OWN
+    every_s: float = 0.0  # between the last two readings it is from
 
     @property
     def body_from_own(self) -> Mat3:
@@ -76,6 +77,9 @@ class Motion:
         self._last: _Heard | None = None
         self._recent: deque[_Heard] = deque(maxlen=12)
         self._epoch = 0
+        self._every_s = 0.0
+        self._inertial_ns: int | None = None
+        self._inertial_every_s = 0.0
         if own not in OWN_TILTS:
             raise ValueError(f"own: want one of {', '.join(OWN_TILTS)}, got {own!r}")
         self._own: _OwnTilt | MargAttitude = _OwnTilt()
@@ -95,6 +99,7 @@ class Motion:
         x, y, z = r.rate_b_rads.tolist()
         euler = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)
         dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
+        self._every_s = min(dt, _LOST_S)
         if last is None:
             yaw, frame = 0.0, of_attitude(r.roll_rad, r.pitch_rad, 0.0)
         elif dt <= _RATES_HOLD_S:
@@ -119,6 +124,9 @@ class Motion:
     def inertial(self, r: InertialReading) -> None:
         """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
         last = self._last
+        if self._inertial_ns is not None and r.boot_ns > self._inertial_ns:
+            self._inertial_every_s = min((r.boot_ns - self._inertial_ns) / 1e9, _LOST_S)
+        self._inertial_ns = r.boot_ns
         if last is not None and r.boot_ns - last.boot_ns <= _FRESH_NS:
             self._own.seed(last.reading)
         else:
@@ -153,7 +161,9 @@ class Motion:
             a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
             roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, heard.yaw_rad + dy * age
             frame = carried(heard.own_frame, heard.rate_b_rads, age)
-            return MotionState(roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame)
+            return MotionState(
+                roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame, every_s=self._every_s
+            )
         own = self._own.at(boot_ns)
         if own is None:
             return None
@@ -168,6 +178,7 @@ class Motion:
             False,
             frame,
             own.tilt_sigma_rad,
+            self._inertial_every_s,
         )
 
 

@@ -262,6 +262,7 @@ class Sample:
     throttle: float | None = None  # share of full, 0 to 1; None where nobody says
     own_tilt_rad: float = math.radians(5.0)  # sigma of the tilt, about each level axis, where it is OWN
     by_hand: bool = False  # taught while disarmed, of a vehicle that flies: turned in somebody's hands
+    tilt_every_s: float = 0.0  # between the readings the tilt is from: what lies between two is guessed at
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -80,6 +80,7 @@ class AdaptiveEstimator:
         self._joined_ago_s = 0.0
         self._axes = 3
         self._own_tilt = False
+        self._tilt_every_s = 0.0  # mean time between attitudes
         self._matrix: Array = _EYE3
         self._inverse: Array = _EYE3
         self._model_mg: tuple[float, float] | None = None
@@ -112,6 +113,7 @@ class AdaptiveEstimator:
         if not s.learn or still or self._wild.step(z, rate * dt):
             return
         self._samples += 1
+        self._tilt_every_s += max(1.0 / self._samples, 0.02) * (s.tilt_every_s - self._tilt_every_s)
         drive = self._drive
         if s.throttle is not None:
             drive = s.throttle - 0.5
@@ -299,14 +301,20 @@ class AdaptiveEstimator:
             if self._model_mg is None:
                 iron_mg2 = iron_mg2 + unknown
                 pulled[at.B] += unknown
+        slow = self._tilt_every_s > self.tuning.slow_s
+        if slow:
+            pulled, iron_mg2, own_mg2 = (self.tuning.slow_doubt * one for one in (pulled, iron_mg2, own_mg2))
         field_apart = 0.0
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
         mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
         soft = np.linalg.inv(_EYE3 + soft_matrix(mean[at.S]))
         said = None if self._second is None else self._second.opinion(expected)
-        if self._own_tilt and said is not None and not self._is_stale():
-            soft = said.soft_iron_b  # a wrong tilt looks like soft iron to the bank
+        if slow or self._own_tilt:  # a wrong tilt looks like soft iron to the bank
+            if said is not None and not self._is_stale():
+                soft = said.soft_iron_b
+            elif slow:
+                soft = _EYE3
         return Estimate(
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
             covariance_mg2=iron_mg2,

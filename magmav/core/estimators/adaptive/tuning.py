@@ -66,6 +66,8 @@ class Tuning:
     own_tilt_most_rad: float = math.radians(30.0)  # beyond it the equation is no turn any more
     own_tilt_tau_s: float = 3.0
     own_tilt_joined: float = 2.0  # times the variance it then has against the second opinion
+    slow_s: float = 0.3  # between attitudes; beyond it what lies between two is guessed at
+    slow_doubt: float = 25.0  # times the variance the bank then claims
     disturbance_mg: float = 1.5
     disturbance_lo_mg: float = 0.5
     disturbance_hi_mg: float = 7.0
