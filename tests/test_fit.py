@@ -143,6 +143,16 @@ def test_AT_15a_fit_refuses_a_compass_at_right_angles_and_prints_what_to_set(tmp
     assert "YAW_90" in to_text(fit_view({"logs": [result]}))
 
 
+def test_AT_1d_fit_prints_the_deviation_card_of_its_json(three):
+    text = to_text(fit_view({"logs": [three["bin"]]}))
+    rows = only(three["bin"])["fit"]["deviation"]
+    assert len(rows) == 8 and "Deviation" in text
+    lines = [line for line in text.splitlines() if " -> " in line and "\u00b1" in line]
+    for line, row in zip(lines, rows, strict=True):
+        before, after, sigma = (round(row[f"{name}_deg"], 1) + 0.0 for name in ("before", "after", "sigma"))
+        assert f"{row['heading_deg']:.0f} " in line and f"{before:+.1f} -> {after:+.1f} \u00b1 {sigma:.1f}" in line
+
+
 def test_AT_15b_thirty_degrees_are_said_to_be_thirty_and_not_hidden_in_the_offsets(tmp_path):
     (path,) = flown(tmp_path, "soft_iron", seconds=115.0, soft=about_down(30.0))
     fit = only(magmav.fit(path))["fit"]

@@ -25,7 +25,8 @@ def fit_view(result: dict[str, Any]) -> RenderableType:
             "reference",
         ):
             table.add_column(name)
-        notes = []
+        notes: list[str] = []
+        cards: list[tuple[str, list[dict[str, Any]]]] = []
         for vehicle in log["vehicles"]:
             for entry in vehicle["compasses"]:
                 fit = entry["fit"]
@@ -49,8 +50,33 @@ def fit_view(result: dict[str, Any]) -> RenderableType:
                 notes += [f"{who}: {r['text']}" for r in fit["reasons"] + fit["causes"]]
                 notes += [f"{who}: cut {c['from_s']:.1f} to {c['to_s']:.1f} s: {c['text']}" for c in fit["cut"]]
                 notes += [f"{who}: {text}" for text in fit["advice"]]
-        parts += [table, *notes]
+                if fit["deviation"]:
+                    several = len(log["vehicles"]) > 1
+                    cards.append((f"system {vehicle['system']}, {who}" if several else who, fit["deviation"]))
+        parts += [table, *notes, *([_deviation(cards)] if cards else [])]
     return Group(*parts)
+
+
+def _deviation(cards: list[tuple[str, list[dict[str, Any]]]]) -> Table:
+    """The deviation card: eight headings, and what each compass shows there more than it should, before and after."""
+    out = Table(
+        title="Deviation, level: shown minus true, deg, as stored -> with the new offsets", title_justify="left"
+    )
+    out.add_column("magnetic heading", justify="right")
+    for who, _ in cards:
+        out.add_column(who, justify="right")
+    for rows in zip(*(rows for _, rows in cards), strict=True):
+        shown = [f"{_signed(r['before_deg'])} -> {_signed(r['after_deg'])} ± {_plain(r['sigma_deg'])}" for r in rows]
+        out.add_row(f"{rows[0]['heading_deg']:.0f}", *shown)
+    return out
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{round(value, 1) + 0.0:+.1f}"  # + 0.0: no minus before nothing
+
+
+def _plain(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
 
 
 def _three(values: list[float | None] | None) -> str:
