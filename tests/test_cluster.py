@@ -34,6 +34,7 @@ def entries(folder: Path, ledger_in: Path, dask: str) -> tuple[list[Any], list[A
         return list(run.entries(ledger)), run.errors, run.table(ledger)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("default")  # of distributed and tornado, while they start and stop
 def test_a_local_cluster_gives_what_one_process_gives(logs: Path, tmp_path: Path) -> None:
     from distributed import LocalCluster

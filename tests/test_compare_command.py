@@ -12,6 +12,7 @@ from magmav.view.plot_compare import Cloud, levelled, plot_compare, thinned
 from magmav.view.records import ViewError
 
 
+@pytest.mark.long
 def test_a_scenario_is_flown_and_judged_by_its_truth(capsys, tmp_path):
     png = tmp_path / "c.png"
     assert main(["compare", "figure8", "--only", "bullock,taubin", "--json", "--plot", str(png)]) == 0

@@ -269,6 +269,7 @@ def test_absent_compass_is_not_invented_and_a_lost_one_goes_silent(flight):
     assert "COMPASS2" not in str(f.service.counts()) and len(f.session.pipeline.vehicles[1].channels) == 1
 
 
+@pytest.mark.long
 def test_payload_taken_on_board_withdraws_the_old_answer_and_finds_the_new_one(flight):
     f = flight(scenario("payload_step"))
     f.fly(seconds=49.0)

@@ -63,6 +63,7 @@ def spoken_by(system: int, frames: list[Frame]) -> list[Frame]:
     return out
 
 
+@pytest.mark.long
 def test_two_vehicles_in_one_tlog_are_fitted_each_as_if_alone(
     flight: list[Frame], alone: dict[str, Any], tmp_path: Path
 ) -> None:

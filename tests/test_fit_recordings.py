@@ -56,6 +56,7 @@ def test_esc_status_log_comes_back_to_within_10_mg_of_what_px4_had_stored():
     assert "STORED_WRONG" not in codes(fit["causes"])
 
 
+@pytest.mark.long
 def test_thor_fitted_on_its_first_half_keeps_3_3_degrees_on_the_second():
     flights = _DATA / "flights"
     options = magmav.FitOptions(heading_reference=str(flights / "thor75_truth.csv"))

@@ -152,6 +152,7 @@ def broad32(capsys, tmp_path):
         return json.loads(capsys.readouterr().out), list(csv.DictReader(file))
 
 
+@pytest.mark.long
 def test_broad32_says_what_it_cannot_know_and_follows_the_magnet(broad32):
     result, records = broad32
     (compass,) = result["vehicles"][0]["compasses"]

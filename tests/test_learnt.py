@@ -23,6 +23,8 @@ from magmav.store_rows import pack
 from magmav.view.learnt import learnt_view
 from magmav.view.table import to_text
 
+pytestmark = pytest.mark.long  # whole flights
+
 FORMAT_2 = (
     FORMAT_1.replace(
         "undone INTEGER NOT NULL DEFAULT 0\n", "undone INTEGER NOT NULL DEFAULT 0, boot_ms INTEGER, kept TEXT\n"

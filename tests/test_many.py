@@ -25,6 +25,8 @@ from magmav.fitting.ledger import Ledger, LedgerError, work_key
 from magmav.fitting.many import Run, Told, find_logs, fit_many
 from magmav.settings import Settings, with_value
 
+pytestmark = pytest.mark.long  # whole folders; test_many_bins.py holds the table
+
 FILES = ("fits.json", "fits.csv", "fits.html")
 KEY = work_key(Settings(), FitOptions())
 WALL_S = 300.0

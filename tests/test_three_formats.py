@@ -27,6 +27,8 @@ from magmav.pipeline import Pipeline
 from magmav.recording import open_recording
 from magmav.settings import Settings, with_value
 
+pytestmark = pytest.mark.long  # test_fit.py holds AT-14a to the after-flight answer; here it is the pipeline's
+
 KINDS = ("tlog", "bin", "ulg")
 CUT_S = 90.0
 

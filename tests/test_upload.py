@@ -565,6 +565,7 @@ def test_AT_8a_late_copies_of_a_write_cannot_undo_the_retreat() -> None:
         assert rig.stored() == OLD, seed
 
 
+@pytest.mark.long
 def test_S1_S3_fuzzed_arming_never_meets_a_write() -> None:
     results = set()
     for seed in range(250):

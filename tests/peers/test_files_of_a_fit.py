@@ -28,6 +28,7 @@ def test_mavproxys_loader_reads_every_value_to_the_last_bit(tmp_path, changed):
     }
 
 
+@pytest.mark.long
 def test_param_load_in_mavproxys_console_puts_them_on_the_vehicle(tmp_path):
     (tmp_path / "new.param").write_text(file_of(entry(ARDUPILOT), ".param"))
     with (

@@ -136,6 +136,7 @@ def test_the_plugin_on_a_link_that_mavproxy_signs_is_believed_and_without_the_ke
         mavproxy.end()
 
 
+@pytest.mark.long
 def test_the_plugin_names_a_second_vehicle_and_follows_mavproxys_vehicle_command(tmp_path):
     port = free_port()
     words = []
