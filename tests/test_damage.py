@@ -144,6 +144,7 @@ def test_broken_recording_in_a_process_of_its_own_leaves_no_traceback(tmp_path):
 # ---------------------------------------------------------------- the port
 
 
+@pytest.mark.long
 def test_a_megabyte_of_noise_on_the_port_does_not_disturb_the_flight(tmp_path):
     """A vehicle flies over a real socket, at the pace of our answers, while somebody sends 1 MB of rubbish."""
     rng, last, sent = random.Random(9), {}, 0

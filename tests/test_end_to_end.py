@@ -6,6 +6,7 @@ import json
 import subprocess
 import time
 
+import pytest
 from flight_rig import IRON_MG, LEVEL
 from process_rig import environment, free_port, magmav, started, stopped
 
@@ -118,6 +119,7 @@ def history_tells_both_writes(day):
     assert upload["old"] == _ZERO and upload["new"] == day["dry"].json["new"]
 
 
+@pytest.mark.long
 def test_a_day_in_the_field(tmp_path):
     """One test, not one for each check, because the day takes half a minute and workers share nothing."""
     day = field_day(tmp_path)
