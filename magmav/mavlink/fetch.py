@@ -8,6 +8,7 @@ Who answered for one of three axes has the other two: for those, silence was the
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ TRIES = 4
 LATE_NS = 5 * _SECOND  # after that twice as long, and so on
 LAST_PAUSE_NS = 480 * _SECOND
 KIN_PAUSE_NS, KIN_TRIES = 2 * _SECOND, 16
+_AXIS = re.compile(r"_[XYZ](?=[A-Z]*$)")  # COMPASS_OFS2_X, CAL_MAG0_XOFF
 
 
 @dataclass(slots=True)
@@ -134,6 +136,5 @@ class ParamFetch:
 
     def _has_kin(self, name: str) -> bool:
         """Has the vehicle answered for another axis of the same three?"""
-        return name[-1] in "XYZ" and any(
-            state.heard for other, state in self._state.items() if other[:-1] == name[:-1] and other[-1] in "XYZ"
-        )
+        three = _AXIS.sub("_#", name)
+        return three != name and any(state.heard and _AXIS.sub("_#", n) == three for n, state in self._state.items())
