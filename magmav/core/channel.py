@@ -30,6 +30,7 @@ _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone, at l
 _UPSET_S = 3.0  # after a sudden change no heading is published: its sigma is that of an answer on its way
 _GUESS_RAD = math.radians(22.0)  # a heading less sure than this is not published: beyond it one sigma is no measure
 _BELIEF_EVERY_NS = 200_000_000
+_IDLE_EVERY_NS = 2_000_000_000  # where nothing is learnt only the circumstances change
 _APART_S = 10.0  # a second opinion that doubts itself for a moment has not come to agree
 _FIELD_WEIGHT = 0.04  # five times a second: a memory of five seconds
 
@@ -151,9 +152,8 @@ class Channel:
             s = self._after_hold(s)
             self._estimator.step(s)
         belief = self._belief
-        if belief is not None and isinstance(self._estimator, Idle):
-            return belief
-        if belief is None or not 0 <= s.boot_ns - belief.boot_ns < _BELIEF_EVERY_NS:
+        every_ns = _IDLE_EVERY_NS if isinstance(self._estimator, Idle) else _BELIEF_EVERY_NS
+        if belief is None or not 0 <= s.boot_ns - belief.boot_ns < every_ns:
             belief = self._believe(s, c)
         return belief
 
