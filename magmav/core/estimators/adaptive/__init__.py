@@ -215,35 +215,27 @@ class AdaptiveEstimator:
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, of_u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
-        self._met(nu[int(np.argmax(bank.log_weight))])
+        self._met(nu[bank.log_weight.argmax()])
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
-        pj = bank.p @ rows.transpose(0, 2, 1)
-        expected = rows @ pj
+        jp = rows @ bank.p
+        expected = jp @ rows.transpose(0, 2, 1)
         expected += bank.common_mg2[:, None, None] * shared_by_all(size, k)
         expected.reshape(count, -1)[:, :: size * k + 1] += bank.white_mg2[:, None]
         apart = expected.reshape(count, size, k, size, k)
         own = np.einsum("kiaib->kiab", apart)
         own += smear(of_u, block, n.sync_s)[..., :k, :k]
         strange = doubted(own, nu, n.doubt_nis)
-        inverse = np.linalg.inv(expected)
-        log_det = np.linalg.slogdet(expected)[1]
-        flat = nu.reshape(count, size * k)
-        pull = (inverse @ flat[:, :, None])[:, :, 0]
-        nis = (flat * pull).sum(1)
-        gain = pj @ inverse
-        bank.x += (pj @ pull[:, :, None])[:, :, 0]
-        bank.p -= gain @ pj.transpose(0, 2, 1)
-        bank.p = 0.5 * (bank.p + bank.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
+        log_likelihood, moved = bank.learn(expected, jp, nu.reshape(count, size * k))
         bank.upright()
-        bank.weigh(-0.5 * (nis + log_det), block.dt_s, n)
-        best = int(np.argmax(bank.log_weight))
+        bank.weigh(log_likelihood, block.dt_s, n)
+        best = int(bank.log_weight.argmax())
         mean = nu.sum(1) / size
-        variance = np.einsum("kiaja->ka", apart) / size**2
+        variance = np.einsum("kaa->ka", apart.sum(1).sum(2)) / size**2
         white = between(mean / np.sqrt(variance), -4.0, 4.0)
-        strangeness = float(np.minimum(strange[best], _STRANGEST).mean()) / k
+        strangeness = sum(min(one, _STRANGEST) for one in strange[best].tolist()) / (k * size)
         self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         if self._blocks > n.adapt_after:
-            adapt(bank, nu, white, bank.common_mg2[:, None] / variance, block.dt_s, n)
+            adapt(bank, nu - mean[:, None], white, bank.common_mg2[:, None] / variance, block.dt_s, n)
             push = bank.x[best, at.D] / bank.disturbance_mg[best]
             like = float(bank.product[best] / max(bank.square[best], 0.1))
             changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
@@ -252,7 +244,7 @@ class AdaptiveEstimator:
         else:
             self._change.since_s += block.dt_s
         self._structure_mg2 = float(bank.common_mg2[best])
-        left = (flat[best] - rows[best] @ (pj[best] @ pull[best])).reshape(size, k) + bank.x[best, at.D][:k]
+        left = nu[best] - (rows[best] @ moved[best]).reshape(size, k) + bank.x[best, at.D][:k]
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
         self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)

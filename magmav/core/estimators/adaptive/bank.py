@@ -173,10 +173,26 @@ class Bank:
         self.p -= gain @ self.p[:, hv, :]
         self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))
 
+    def learn(self, expected: Array, jp: Array, nu: Array) -> tuple[Array, Array]:
+        """Kalman's update. The log likelihood (K,), but for a constant, and by how much x moved, (K, n).
+
+        nu (K, m) : innovations.  expected (K, m, m) : their covariance.  jp (K, m, n) : Jacobian times p.
+        With expected = L L' all that is wanted comes of L^-1 (J P, nu).
+        """
+        root = np.linalg.cholesky(expected)
+        white = np.linalg.solve(root, np.concatenate((jp, nu[:, :, None]), 2))
+        by_jp, by_nu = white[:, :, :-1].transpose(0, 2, 1), white[:, :, -1:]
+        moved: Array = (by_jp @ by_nu)[:, :, 0]
+        self.x += moved
+        self.p -= by_jp @ by_jp.transpose(0, 2, 1)
+        self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
+        log_det = np.log(np.einsum("kii->ki", root)).sum(1)
+        return -0.5 * (by_nu * by_nu).sum((1, 2)) - log_det, moved
+
     def upright(self) -> None:
         """A level field of negative strength points the other way: the same, said as everybody says it."""
-        over = self.x[:, at.H] < 0.0
-        if over.any():
+        if self.x[:, at.H].min() < 0.0:
+            over = self.x[:, at.H] < 0.0
             self.x[over, at.H] *= -1.0
             self.x[over, at.ALPHA] += math.pi
             self.p[over, at.H, :] *= -1.0
@@ -217,10 +233,9 @@ class Bank:
     def weigh(self, log_likelihood: Array, dt_s: float, n: Tuning) -> None:
         """Better foretold, more believed; old merit fades, so that a model can come back."""
         fade = math.exp(-dt_s / n.forget_s)
-        self.log_weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
-        astray = np.abs(self.x[:, at.S]).max(1) > n.soft_most
-        self.log_weight -= np.where(astray, _ASTRAY, 0.0)
-        self.log_weight = np.maximum(self.log_weight - self.log_weight.max(), _LEAST)
+        weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
+        weight -= _ASTRAY * (np.abs(self.x[:, at.S]).max(1) > n.soft_most)
+        self.log_weight = np.maximum(weight - weight.max(), _LEAST)
 
     def tidy(self, n: Tuning, most: int) -> None:
         """Drop what is not believed, merge what has become the same; the best of each model stays, and few others."""

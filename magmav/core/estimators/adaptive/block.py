@@ -120,9 +120,9 @@ class Gathering:
         rates = np.array(self._rates)
         turns = np.zeros((len(rates), 3, 6))
         turns[:, :, :2] = bodies[:, :, :2]
-        turns[:, 0, 2] = turns[:, 1, 3] = 1.0
-        turns[:, 0, 4], turns[:, 1, 4] = -down_b[:, 1], down_b[:, 0]
-        turns[:, :, 5] = rates
+        turns[:, :, 2] = rates
+        turns[:, 0, 3], turns[:, 1, 3] = -down_b[:, 1], down_b[:, 0]
+        turns[:, 0, 4] = turns[:, 1, 5] = 1.0
         last = self._last
         assert last is not None  # nobody closes an empty one
         same = np.zeros((len(rates), 3, SIZE))

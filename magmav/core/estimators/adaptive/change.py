@@ -42,8 +42,8 @@ class ChangeWatch:
         if dt_s <= 0.0:
             return False
         fade = math.exp(-dt_s / n.change_tau_s)
-        self._mean[:k] = fade * self._mean[:k] + (1.0 - fade) * white
-        self._innovation_mg[:k] = fade * self._innovation_mg[:k] + (1.0 - fade) * innovation_mg
+        self._mean[:k] += (1.0 - fade) * (white - self._mean[:k])
+        self._innovation_mg[:k] += (1.0 - fade) * (innovation_mg - self._innovation_mg[:k])
         self._alike += min(dt_s / _ALIKE_S, 0.1) * (like - self._alike)  # slowly: a change itself looks alike, too
         self._seen = min(self._seen + 1.0, (1.0 + fade) / (1.0 - fade))
         if self.since_s < n.change_hold_s or self._seen < 5.0:

@@ -34,5 +34,6 @@ G = slice(20, 23)
 T = 23
 KAPPA = 24
 R = slice(25, 27)
-TURNS = np.array((6, 7, 25, 26, KAPPA, T))  # all that turns the field: e, r, kappa and t
+LATE = slice(23, 27)  # t, kappa and r
+TURNS = np.array((6, 7, 23, 24, 25, 26))  # all that turns the field: e, t, kappa and r
 SIZE = 27

@@ -19,7 +19,6 @@ from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.block import Block
 from magmav.core.estimators.adaptive.layout import Array
 
-_EYE3 = np.eye(3)
 _PLACES = np.array((0, 3, 4, 3, 1, 5, 4, 5, 2))  # where each entry of S stands among the six
 
 
@@ -30,7 +29,7 @@ def soft_matrix(s: Array) -> Array:
 
 
 # (3, 18): u times this is S u as a matrix of the six of S
-_SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel() for unit in _EYE3])
+_SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]).ravel() for unit in np.eye(3)])
 
 
 # (3, 9): v times this is [v x]
@@ -45,27 +44,29 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     """
     k, n = len(x), len(block)
     angle = x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T
+    level, ahead, right = x[:, at.H, None], np.cos(angle), np.sin(angle)
     own = np.zeros((k, n, 3, 4))  # own frame: the field, a right angle on from its level part, and 1 mG ahead and down
-    own[..., 0, 2], own[..., 1, 2], own[..., 2, 3] = np.cos(angle), np.sin(angle), 1.0
-    own[..., :2, 0] = x[:, at.H, None, None] * own[..., :2, 2]
-    own[..., 0, 1], own[..., 1, 1] = -own[..., 1, 0], own[..., 0, 0]
+    own[..., 0, 2], own[..., 1, 2], own[..., 2, 3] = ahead, right, 1.0
+    own[..., 0, 0] = own[..., 1, 1] = level * ahead
+    own[..., 1, 0] = level * right
+    own[..., 0, 1] = -own[..., 1, 0]
     own[..., 2, 0] = x[:, at.V, None]
     body = block.body_from_own @ own
-    around = cross_matrices((block.turns_b @ x[:, None, at.TURNS, None])[..., 0])
-    turned = (_EYE3 + around + 0.5 * (around @ around)) @ body
-    seen = turned[..., 0]
-    with_soft = (soft_matrix(x[:, at.S]) + _EYE3)[:, None] @ turned[..., :2]
-    y = with_soft[..., 0] + (x @ block.same.reshape(-1, at.SIZE).T).reshape(k, n, 3)
-    turning = with_soft[..., 1]
+    around = cross_matrices((x[:, at.TURNS] @ block.turns_b.reshape(-1, 6).T).reshape(k, n, 3))
+    turned = body + around @ (body + 0.5 * (around @ body))
+    seen, turning = turned[..., 0], turned[..., 1]
     j = np.empty((k, n, 3, at.SIZE))
     j[:] = block.same
+    j[..., at.S] = (seen @ _SOFT).reshape(k, n, 3, 6)
+    y = seen + (j.reshape(k, -1, at.SIZE) @ x[:, :, None]).reshape(k, n, 3)  # in all columns there so far it is linear
+    turning = turning + turning @ soft_matrix(x[:, at.S])
     j[..., at.ALPHA] = turning
     j[..., at.H : at.V + 1] = turned[..., 2:]
-    j[..., at.S] = (seen @ _SOFT).reshape(k, n, 3, 6)
-    j[..., at.G] = -turning[..., None] * block.ahead_s[:, None, :]
+    j[..., at.G] = turning[..., None] * -block.ahead_s[:, None]
     of_u = cross_matrices(body[..., 0])
-    by_q = of_u + around @ of_u - 0.5 * (of_u @ around)  # with [(q x u) x] = [q x] [u x] - [u x] [q x]
-    j[..., at.TURNS] = -(by_q @ block.turns_b)
+    u_q = of_u @ around  # its transpose is [q x] [u x], and [(q x u) x] is that less this
+    by_turns = (0.5 * u_q - u_q.swapaxes(2, 3) - of_u) @ block.turns_b
+    j[..., at.E], j[..., at.LATE] = by_turns[..., :2], by_turns[..., 2:]
     return y, j, of_u
 
 

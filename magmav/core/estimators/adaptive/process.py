@@ -25,9 +25,9 @@ def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt_r
     """
     x, p = bank.x, bank.p
     x[:, at.ALPHA] += x[:, at.G] @ down_s
-    turning = p[:, at.ALPHA, :] + down_s @ p[:, at.G, :]
+    turning = p[:, at.ALPHA] + down_s @ p[:, at.G]
     turning[:, at.ALPHA] += turning[:, at.G] @ down_s
-    p[:, at.ALPHA, :] = p[:, :, at.ALPHA] = turning
+    p[:, at.ALPHA] = p[:, :, at.ALPHA] = turning
     tilt_rad, tilt_tau_s = n.tilt_rad, n.tilt_tau_s
     if own_tilt_rad is not None:
         tilt_rad, tilt_tau_s = min(n.own_tilt_doubt * own_tilt_rad, n.own_tilt_most_rad), n.own_tilt_tau_s

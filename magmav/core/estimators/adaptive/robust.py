@@ -126,10 +126,10 @@ def doubted(expected: Array, nu: Array, doubt_nis: float) -> Array:
     return nis
 
 
-def adapt(bank: Bank, nu: Array, mean_white: Array, mean_share: Array, dt_s: float, n: Tuning) -> None:
+def adapt(bank: Bank, inside: Array, mean_white: Array, mean_share: Array, dt_s: float, n: Tuning) -> None:
     """Noise as it shows.
 
-    nu (K, n, k) : innovations.  mean_white (K, k) : their mean over the block, whitened, clipped.
+    inside (K, n, k) : innovations less their mean over the block.  mean_white (K, k) : that mean, whitened, clipped.
     mean_share (K, k) : how much of that mean's variance is the block's own noise.
     """
     weight, k = min(dt_s / 5.0, 0.2), mean_white.shape[1]
@@ -139,15 +139,15 @@ def adapt(bank: Bank, nu: Array, mean_white: Array, mean_share: Array, dt_s: flo
     bank.last[:, :k] = mean_white
     bank.seen_s += dt_s
     rate = min(dt_s / min(max(0.5 * bank.seen_s, n.adapt_first_s), n.adapt_s), 0.3)
-    if nu.shape[1] > 2:
-        inside = np.abs(nu - nu.sum(1, keepdims=True) / nu.shape[1]).reshape(len(nu), -1)
+    if inside.shape[1] > 2:
+        inside = np.abs(inside).reshape(len(inside), -1)
         inside.sort(axis=1)
         size = inside.shape[1]
         middle = 0.5 * (inside[:, size // 2] + inside[:, (size - 1) // 2])
-        scatter = middle**2 * (_MEDIAN_TO_VARIANCE * nu.shape[1] / (nu.shape[1] - 1))
+        scatter = middle * middle * (_MEDIAN_TO_VARIANCE * size / (size - k))
         bank.white_mg2 += rate * (between(scatter, n.white_lo_mg**2, n.white_hi_mg**2) - bank.white_mg2)
-    push = between((mean_share * (square - 1.0)).sum(1) / k, -1.0, 2.0)
-    bank.common_mg2 = between(bank.common_mg2 * np.exp(rate * push), n.common_lo_mg**2, n.common_hi_mg**2)
+    push = (mean_share * (square - 1.0)).sum(1) / k
     like = between(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
-    longer = np.exp(rate * between(4.0 * (like - 0.1), -1.0, 2.0))
+    common, longer = np.exp(rate * between(np.array((push, 4.0 * (like - 0.1))), -1.0, 2.0))
+    bank.common_mg2 = between(bank.common_mg2 * common, n.common_lo_mg**2, n.common_hi_mg**2)
     bank.disturbance_mg = between(bank.disturbance_mg * longer, n.disturbance_lo_mg, n.disturbance_hi_mg)
