@@ -1,4 +1,4 @@
-"""The stretch of a flight that both passes go over: which Samples, each with its own frame, and time turned round."""
+"""The stretch of a flight that is known whole afterwards: which Samples, and each with a frame of its own."""
 
 from __future__ import annotations
 
@@ -40,12 +40,3 @@ def framed(samples: Sequence[Sample]) -> list[Sample]:
             s = replace(s, body_from_own=frame)
         out.append(s if s.model_mg is not None or model_mg is None else replace(s, model_mg=model_mg))
     return out
-
-
-def backwards(samples: Sequence[Sample]) -> list[Sample]:
-    """The same with time turned round. Twice turned, all but the first's step and gap are as they were."""
-    if not samples:
-        return []
-    last = replace(samples[-1], dt_s=0.0, yaw_step_rad=0.0, gap=False)
-    rest = zip(reversed(samples[:-1]), reversed(samples[1:]), strict=True)
-    return [last, *(replace(s, dt_s=n.dt_s, yaw_step_rad=-n.yaw_step_rad, gap=n.gap) for s, n in rest)]

@@ -51,8 +51,6 @@ _STRANGEST = 60.0  # of one reading's normalised innovation squared, in its mean
 class AdaptiveEstimator:
     """One compass's bank."""
 
-    _way = 1.0  # -1 where time runs backwards
-
     def __init__(self, tuning: Tuning | None = None, second: bool = True) -> None:
         """second : is a second opinion heard as well?"""
         self.tuning = tuning or Tuning()
@@ -103,7 +101,7 @@ class AdaptiveEstimator:
         about_down, rate = float(s.rate_b_rads @ down_b) * dt, math.hypot(*s.rate_b_rads.tolist())
         still = s.learn and self._still.step(z, rate, dt) and not len(gathering)
         if still:
-            gathering.rests(dt, self._way * about_down)
+            gathering.rests(dt, about_down)
         else:
             walk = n.turn_walk_rad if s.tilt_from == "ATTITUDE" else 4.0 * n.turn_walk_rad
             gathering.passes(dt, down_b, walk**2 * dt + (n.turn_scale * about_down) ** 2)
@@ -144,9 +142,6 @@ class AdaptiveEstimator:
     def _begun(self, field: tuple[float, float, float, float], iron_mg: Array | None = None) -> Bank:
         return Bank.opened(field, self.tuning, iron_mg)
 
-    def _lose_heading(self, bank: Bank) -> None:
-        bank.lose_heading(self.tuning)
-
     def _leave_ground(self, s: Sample, z: Array, down_b: Array) -> None:
         """What stood about it while it was turned by hand does not fly along: only where the iron is about stays."""
         if len(self._gathering):
@@ -162,10 +157,13 @@ class AdaptiveEstimator:
 
     def _learn(self) -> None:
         """Take in the block that has gathered."""
-        n, bank, block = self.tuning, self._bank, self._gathering.close()
+        self._take_in(self._gathering.close())
+
+    def _take_in(self, block: Block) -> None:
+        n, bank = self.tuning, self._bank
         assert bank is not None  # made with the first sample
         if self._lost and self._blocks:  # who has just begun knows no heading anyway
-            self._lose_heading(bank)
+            bank.lose_heading(n)
         self._lost = False
         if block.dt_s > 0.0 and self._blocks:
             bank.x[:, at.ALPHA] += block.turned_rad
@@ -215,7 +213,6 @@ class AdaptiveEstimator:
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, of_u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
-        self._met(nu[bank.log_weight.argmax()])
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         jp = rows @ bank.p
         expected = jp @ rows.transpose(0, 2, 1)
@@ -248,9 +245,6 @@ class AdaptiveEstimator:
         self._residual_n += size
         weight = size / min(self._residual_n, 500)
         self._residual_mg2 += weight * (float((left * left).sum()) / (k * size) - self._residual_mg2)
-
-    def _met(self, nu: Array) -> None:
-        """What the most believed hypothesis did not foretell of a block, (n, axes) mG."""
 
     def _open(self, bank: Bank, block: Block) -> None:
         """The iron has changed. What else is known stays; where that is not even the field, begin anew."""

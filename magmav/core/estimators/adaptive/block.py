@@ -18,17 +18,14 @@ _REST_RAD = 0.02  # what stood still may have turned: the field would hardly sho
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """n samples in arrays; body axes, mG, s, rad.
+class Readings:
+    """n samples in arrays; body axes, mG, s, rad. Or n samples of each of many blocks: one more axis in front of all.
 
     z (n, 3) : A m + e.  body_from_own (n, 3, 3).  rate_rads2 (n,) : square of the turn rate.
     turns_b (n, 3, 6) : about what each of the states layout.TURNS turns the field.
-    same (n, 3, SIZE) : the part of the Jacobian that depends on no state: iron, disturbance and throttle.
     calmed_rad (n,) : tilt taken out of the attitude, where it may be noise.
+    same (n, 3, SIZE) : the part of the Jacobian that depends on no state: iron, disturbance and throttle.
     ahead_s (n, 3) : integral of down_b from the sample to the block's end.
-    own_tilt_rad : sigma of the tilt where it is that of gyro and accelerometer alone, None where it is the autopilot's.
-    dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
-    turned_rad : what the own frame turned about its down while the vehicle stood still.
     """
 
     z: Array
@@ -38,6 +35,17 @@ class Block:
     calmed_rad: Array
     same: Array
     ahead_s: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block(Readings):
+    """n samples taken in together, and the time since the block before.
+
+    own_tilt_rad : sigma of the tilt where it is that of gyro and accelerometer alone, None where it is the autopilot's.
+    dt_s, down_s (3,), turn_rad2 : time, integral of down_b and variance of the turn since the block before.
+    turned_rad : what the own frame turned about its down while the vehicle stood still.
+    """
+
     dt_s: float
     down_s: Array
     turn_rad2: float
@@ -50,12 +58,27 @@ class Block:
         return len(self.z)
 
 
+def fixed_parts(bodies: Array, rates: Array, matrix: Array, drives: Array) -> tuple[Array, Array]:
+    """Readings.turns_b and Readings.same.
+
+    bodies (..., 3, 3), rates (..., 3), drives (...) : throttle less a half.  matrix (3, 3), or (..., 3, 3).
+    """
+    turns = np.zeros((*drives.shape, 3, 6))
+    turns[..., :2] = bodies[..., :2]
+    turns[..., 2] = rates
+    turns[..., 0, 3], turns[..., 1, 3] = -bodies[..., 1, 2], bodies[..., 0, 2]
+    turns[..., 0, 4] = turns[..., 1, 5] = 1.0
+    same = np.zeros((*drives.shape, 3, SIZE))
+    same[..., B], same[..., D] = matrix, _EYE3
+    same[..., K] = drives[..., None, None] * _EYE3
+    return turns, same
+
+
 class Gathering:
     """Samples on their way into a block, and the time that has passed since the last one."""
 
     def __init__(self) -> None:
         self._last: Sample | None = None
-        self.boots_ns: list[int] = []
         # Plain numbers: small, saved or not.
         self._bodies: list[list[list[float]]] = []
         self._z: list[list[float]] = []
@@ -105,7 +128,6 @@ class Gathering:
         if not self._z:
             self._first_s = self._dt_s
         self._last = s
-        self.boots_ns.append(s.boot_ns)
         self._z.append(z.tolist())
         self._bodies.append(body_from_own.tolist())
         self._rates.append(s.rate_b_rads.tolist())
@@ -115,19 +137,9 @@ class Gathering:
 
     def close(self) -> Block:
         """All of them as one block, and begin anew."""
-        bodies = np.array(self._bodies)
-        down_b = bodies[:, :, 2]
-        rates = np.array(self._rates)
-        turns = np.zeros((len(rates), 3, 6))
-        turns[:, :, :2] = bodies[:, :, :2]
-        turns[:, :, 2] = rates
-        turns[:, 0, 3], turns[:, 1, 3] = -down_b[:, 1], down_b[:, 0]
-        turns[:, 0, 4] = turns[:, 1, 5] = 1.0
-        last = self._last
+        bodies, rates, last = np.array(self._bodies), np.array(self._rates), self._last
         assert last is not None  # nobody closes an empty one
-        same = np.zeros((len(rates), 3, SIZE))
-        same[..., B], same[..., D] = last.shaping.matrix, _EYE3
-        same[..., K] = np.array(self._drives)[:, None, None] * _EYE3
+        turns, same = fixed_parts(bodies, rates, last.shaping.matrix, np.array(self._drives))
         out = Block(
             z=np.array(self._z),
             body_from_own=bodies,

@@ -16,7 +16,7 @@ from functools import cache
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.block import Block
+from magmav.core.estimators.adaptive.block import Readings
 from magmav.core.estimators.adaptive.layout import Array
 
 _PLACES = np.array((0, 3, 4, 3, 1, 5, 4, 5, 2))  # where each entry of S stands among the six
@@ -36,14 +36,15 @@ _SOFT = np.stack([np.column_stack([soft_matrix(row) @ unit for row in np.eye(6)]
 _CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
 
 
-def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
+def equation(x: Array, block: Readings) -> tuple[Array, Array, Array]:
     """Predicted A m + e (K, n, 3) mG, its Jacobian (K, n, 3, SIZE), and [u x] (K, n, 3, 3) mG.
 
+    x (K, SIZE) : hypotheses about one block; or one state for each of K blocks.
     The columns of H, V, tilt and soft iron are taken at S = 0: relinearised there, the product of field and soft
     iron invents information (estimation.md section 7.4).
     """
-    k, n = len(x), len(block)
-    angle = x[:, at.ALPHA, None] - x[:, at.G] @ block.ahead_s.T
+    k, n = len(x), block.z.shape[-2]
+    angle = x[:, at.ALPHA, None] - (block.ahead_s @ x[:, at.G, None])[..., 0]
     level, ahead, right = x[:, at.H, None], np.cos(angle), np.sin(angle)
     own = np.zeros((k, n, 3, 4))  # own frame: the field, a right angle on from its level part, and 1 mG ahead and down
     own[..., 0, 2], own[..., 1, 2], own[..., 2, 3] = ahead, right, 1.0
@@ -52,7 +53,7 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     own[..., 0, 1] = -own[..., 1, 0]
     own[..., 2, 0] = x[:, at.V, None]
     body = block.body_from_own @ own
-    around = cross_matrices((x[:, at.TURNS] @ block.turns_b.reshape(-1, 6).T).reshape(k, n, 3))
+    around = cross_matrices((block.turns_b @ x[:, None, at.TURNS, None])[..., 0])
     turned = body + around @ (body + 0.5 * (around @ body))
     seen, turning = turned[..., 0], turned[..., 1]
     j = np.empty((k, n, 3, at.SIZE))
@@ -62,7 +63,7 @@ def equation(x: Array, block: Block) -> tuple[Array, Array, Array]:
     turning = turning + turning @ soft_matrix(x[:, at.S])
     j[..., at.ALPHA] = turning
     j[..., at.H : at.V + 1] = turned[..., 2:]
-    j[..., at.G] = turning[..., None] * -block.ahead_s[:, None]
+    j[..., at.G] = turning[..., None] * -block.ahead_s[..., None, :]
     of_u = cross_matrices(body[..., 0])
     u_q = of_u @ around  # its transpose is [q x] [u x], and [(q x u) x] is that less this
     by_turns = (0.5 * u_q - u_q.swapaxes(2, 3) - of_u) @ block.turns_b
@@ -82,11 +83,11 @@ def shared_by_all(n: int, axes: int) -> Array:
     return np.tile(np.eye(axes), (n, n))
 
 
-def smear(of_u: Array, block: Block, sync_s: float) -> Array:
+def smear(of_u: Array, block: Readings, sync_s: float) -> Array:
     """(K, n, 3, 3) mG^2: what a mismatch in time or tilt does to the field; it never changes the field's length.
 
     of_u (K, n, 3, 3) : [u x], whose square is u u' - |u|^2 I.
     """
     share = sync_s**2 * block.rate_rads2 + block.calmed_rad**2
-    out: Array = -share[:, None, None] * (of_u @ of_u)
+    out: Array = -share[..., None, None] * (of_u @ of_u)
     return out

@@ -16,20 +16,20 @@ from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 from magmav.core.rotation import rotation
 
-_WILD_MG, _WILD_MG_PER_RAD = 50.0, 330.0
-_WILD_OF = 5
+WILD_MG, WILD_MG_PER_RAD = 50.0, 330.0
+WILD_OF = 5
 _TILTS, _TILTS_LEAST = 3000, 100  # readings remembered, and wanted before anything is made of them
 _STILL_RADS, _STILL_MG = 0.02, 4.0  # slower than the bias of a bad gyro, and less change than noise leaves
 _STILL_MEAN_S, _STILL_S = 1.0, 3.0
-_MEDIAN_TO_VARIANCE = 2.2  # variance of a normal value over the squared median of its size
+MEDIAN_TO_VARIANCE = 2.2  # variance of a normal value over the squared median of its size
 
 
 class WildGate:
     """Is a reading far from the middle of the last five, more than turning explains? (estimation.md section 5)"""
 
     def __init__(self) -> None:
-        self._last: deque[tuple[float, float, float]] = deque(maxlen=_WILD_OF)
-        self._turns: deque[float] = deque(maxlen=_WILD_OF)
+        self._last: deque[tuple[float, float, float]] = deque(maxlen=WILD_OF)
+        self._turns: deque[float] = deque(maxlen=WILD_OF)
 
     def step(self, z: Array, turn_rad: float) -> bool:
         """Take a reading (3,) and how far the vehicle turned since the one before."""
@@ -40,7 +40,7 @@ class WildGate:
             return False
         middle = [sorted(axis)[len(self._last) // 2] for axis in zip(*self._last, strict=True)]
         off: float = max(abs(x - middle[0]), abs(y - middle[1]), abs(w - middle[2]))
-        return bool(off > _WILD_MG + _WILD_MG_PER_RAD * sum(self._turns))
+        return bool(off > WILD_MG + WILD_MG_PER_RAD * sum(self._turns))
 
 
 class Stillness:
@@ -144,7 +144,7 @@ def adapt(bank: Bank, inside: Array, mean_white: Array, mean_share: Array, dt_s:
         inside.sort(axis=1)
         size = inside.shape[1]
         middle = 0.5 * (inside[:, size // 2] + inside[:, (size - 1) // 2])
-        scatter = middle * middle * (_MEDIAN_TO_VARIANCE * size / (size - k))
+        scatter = middle * middle * (MEDIAN_TO_VARIANCE * size / (size - k))
         bank.white_mg2 += rate * (between(scatter, n.white_lo_mg**2, n.white_hi_mg**2) - bank.white_mg2)
     push = (mean_share * (square - 1.0)).sum(1) / k
     like = between(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
