@@ -32,7 +32,7 @@ class AfterFlight:
     boot_ns: NDArray[np.int64]
     estimates: tuple[Estimate, ...]
     changes_ns: tuple[int, ...]
-    foretold: Estimate | None = None  # by the time asked for, with nothing of what came after
+    foretold: Estimate | None = None  # by the time asked for, with nothing of what the compass said after it
 
     @property
     def answer(self) -> Estimate:
@@ -77,7 +77,7 @@ def after_flight(
         return None
     foretold = None
     if until_ns is not None:
-        first = smooth([s for s in stretch if s.boot_ns <= until_ns], tuning)
+        first = whole.first(int(np.searchsorted(times, until_ns, side="right")))
         foretold = None if first is None else first.estimate(len(first.nodes) - 1)
     return AfterFlight(
         np.array([t for t, _ in known], dtype=np.int64),

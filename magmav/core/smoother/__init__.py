@@ -60,6 +60,13 @@ class Smoothed:
     forth: Forth
     tuning: Tuning
 
+    def first(self, count: int) -> Smoothed | None:
+        """As it would have been solved with the first nodes alone."""
+        if count < _LEAST_NODES:
+            return None
+        nodes = self.nodes.first(count)
+        return _Search(nodes, self.forth.first(nodes), self.tuning).run()
+
     @property
     def log_weights(self) -> Array:
         """Of the models, the best one zero."""
@@ -211,7 +218,7 @@ def north(nodes: Nodes, x: Array) -> Array:
     What the gyro's bias turns is taken out first, so that no more than half a turn lies between two nodes.
     """
     r = nodes.readings(0, len(nodes))
-    iron = (nodes.matrix @ x[:, at.B, None])[:, None, :, 0]
+    iron = (nodes.matrix() @ x[:, at.B, None])[:, None, :, 0]
     seen = r.z - iron - nodes.columns.drive[nodes.rows][..., None] * x[:, None, at.K]
     level = ((r.body_from_own.swapaxes(-1, -2) @ seen[..., None])[..., 0] * nodes.there[..., None]).sum(1)
     turned = np.concatenate(([0.0], np.cumsum(nodes.down_s @ x[-1, at.G] + nodes.turned_rad)))

@@ -49,19 +49,26 @@ class Forth(AdaptiveEstimator):
 
     def go(self, nodes: Nodes, late_s: float) -> None:
         """Over a stretch. late_s : a change is noticed within so long."""
-        believed, before = [], None
+        believed = []
         at_s = np.concatenate(([0.0], np.cumsum(nodes.dt_s)))
-        for i in range(len(nodes)):
+        for i, block in enumerate(nodes.blocks()):
             since_s = self._change.since_s
-            self._lost = before is not None and bool(nodes.lost[before:i].any())
-            self._take_in(nodes.block(i, before))
+            self._lost = i > 0 and bool(nodes.lost[i - 1])
+            self._take_in(block)
             if self._change.since_s < since_s:
                 early = int(np.searchsorted(at_s, at_s[i] - late_s))
                 self.notices.append(Notice(i, i - min(early, i - 1)))
             assert self._bank is not None
             believed.append(self._bank.x[int(self._bank.log_weight.argmax())])
-            before = i
         self.believed = np.array(believed)
+
+    def first(self, nodes: Nodes) -> Forth:
+        """As it was at the end of these, the first ones of those it went over."""
+        out = copy.copy(self)
+        out.believed = self.believed[: len(nodes)]
+        out.notices = [notice for notice in self.notices if notice.node < len(nodes)]
+        out._samples = int(nodes.there.sum())
+        return out
 
     def says(self, bank: Bank, changed_ago_s: float, residual_mg: float, step_nis: float) -> Estimate | None:
         """The estimate, had this been believed."""

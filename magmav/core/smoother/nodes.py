@@ -7,7 +7,8 @@ are about tuning.nodes_most of them at most.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from magmav.core.estimators.adaptive.block import Block, Readings, fixed_parts
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 from magmav.core.smoother.columns import Columns, Flags
+
+_AT_ONCE = 512  # nodes: what is laid out for each is some kilobytes
+_OF_READINGS = tuple(f.name for f in fields(Readings))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,11 +80,10 @@ class Nodes:
         """(n,), of the last reading."""
         return self.columns.boot_ns[self.last]
 
-    @property
-    def matrix(self) -> Array:
+    def matrix(self, part: slice = slice(None)) -> Array:
         """(n, 3, 3), A."""
         c = self.columns
-        return np.array([k.matrix for k in c.shapings])[c.shaping[self.last]]
+        return np.array([k.matrix for k in c.shapings])[c.shaping[self.last[part]]]
 
     def tilt(self, n: Tuning) -> tuple[Array, Array]:
         """Sigma of the tilt and how long it lasts, (n,) rad and s."""
@@ -92,7 +95,7 @@ class Nodes:
         """Of nodes a to b, one axis in front of all."""
         c, rows = self.columns, self.rows[a:b]
         bodies, rates = c.body_from_own[rows], c.rates[rows]
-        matrix = self.matrix[a:b, None]
+        matrix = self.matrix(slice(a, b))[:, None]
         turns, same = fixed_parts(bodies, rates, matrix, c.drive[rows])
         return Readings(
             z=c.z[rows],
@@ -104,20 +107,30 @@ class Nodes:
             ahead_s=self.ahead_s[a:b],
         )
 
-    def block(self, i: int, before: int | None) -> Block:
-        """Node i as the estimator that flies takes it in, where the one it took in before was that."""
-        c, m = self.columns, int(self.there[i].sum())
-        one, last, since = self.readings(i, i + 1), self.rows[i, -1], slice(i if before is None else before, i)
-        return Block(
-            **{name: getattr(one, name)[0, :m] for name in Readings.__dataclass_fields__},
-            dt_s=float(self.dt_s[since].sum()),
-            down_s=self.down_s[since].sum(0),
-            turn_rad2=float(self.turn_rad2[since].sum()),
-            turned_rad=float(self.turned_rad[since].sum()),
-            shaping=c.shapings[c.shaping[last]],
-            axes=c.axes,
-            own_tilt_rad=float(c.own_tilt_rad[last]) if c.own_tilt[last] else None,
-        )
+    def first(self, count: int) -> Nodes:
+        """The first ones alone: nothing of what the compass says later is in them."""
+        cut, between = slice(count), slice(max(count - 1, 0))
+        own = {name: getattr(self, name)[cut] for name in ("rows", "there", "ahead_s")}
+        times = {name: getattr(self, name)[between] for name in ("dt_s", "down_s", "turn_rad2", "turned_rad", "lost")}
+        return replace(self, **own, **times)
+
+    def blocks(self) -> Iterator[Block]:
+        """One after the other, as the estimator that flies takes them in."""
+        c = self.columns
+        for a in range(0, len(self), _AT_ONCE):
+            many = self.readings(a, a + _AT_ONCE)
+            for i in range(a, min(a + _AT_ONCE, len(self))):
+                m, last, since = int(self.there[i].sum()), self.rows[i, -1], max(i - 1, 0)
+                yield Block(
+                    **{name: getattr(many, name)[i - a, :m] for name in _OF_READINGS},
+                    dt_s=float(self.dt_s[since]) if i else 0.0,
+                    down_s=self.down_s[since],
+                    turn_rad2=float(self.turn_rad2[since]),
+                    turned_rad=float(self.turned_rad[since]),
+                    shaping=c.shapings[c.shaping[last]],
+                    axes=c.axes,
+                    own_tilt_rad=float(c.own_tilt_rad[last]) if c.own_tilt[last] else None,
+                )
 
 
 def _groups(c: Columns, n: Tuning) -> list[list[int]]:
