@@ -26,7 +26,7 @@ from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import equation, shared_by_all, smear, soft_matrix
+from magmav.core.estimators.adaptive.measurement import equation, means, shared_by_all, smear, soft_matrix
 from magmav.core.estimators.adaptive.opinion import doubt, joined, known, own_covariance, stale
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
@@ -215,30 +215,30 @@ class AdaptiveEstimator:
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, of_u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
+        flat = nu.reshape(count, size * k)
         self._met(nu[bank.log_weight.argmax()])
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         jp = rows @ bank.p
         expected = jp @ rows.transpose(0, 2, 1)
         expected += bank.common_mg2[:, None, None] * shared_by_all(size, k)
         expected.reshape(count, -1)[:, :: size * k + 1] += bank.white_mg2[:, None]
-        apart = expected.reshape(count, size, k, size, k)
-        own = np.einsum("kiaib->kiab", apart)
+        own = np.einsum("kiaib->kiab", expected.reshape(count, size, k, size, k))
         own += smear(of_u, block, n.sync_s)[..., :k, :k]
         strange = doubted(own, nu, n.doubt_nis)
-        log_likelihood, moved = bank.learn(expected, jp, nu.reshape(count, size * k))
+        log_likelihood, moved = bank.learn(expected, jp, flat)
         bank.upright()
         bank.weigh(log_likelihood, block.dt_s, n)
         best = int(bank.log_weight.argmax())
-        mean = nu.sum(1) / size
-        variance = np.einsum("kaa->ka", apart.sum(1).sum(2)) / size**2
+        by = means(size, k)
+        mean, variance = flat @ by, (expected @ by * by).sum(1)
         white = between(mean / np.sqrt(variance), -4.0, 4.0)
         strangeness = sum(min(one, _STRANGEST) for one in strange[best].tolist()) / (k * size)
         self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         if self._blocks > n.adapt_after:
             adapt(bank, nu - mean[:, None], white, bank.common_mg2[:, None] / variance, block.dt_s, n)
-            push = bank.x[best, at.D] / bank.disturbance_mg[best]
-            like = float(bank.product[best] / max(bank.square[best], 0.1))
-            changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
+            disturbance = math.hypot(*bank.x[best, at.D].tolist()) / float(bank.disturbance_mg[best])
+            like = float(bank.product[best]) / max(float(bank.square[best]), 0.1)
+            changed = self._change.step(white[best], mean[best], like, disturbance**2, self._nis, block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
         else:

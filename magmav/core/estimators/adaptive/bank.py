@@ -186,8 +186,8 @@ class Bank:
         self.x += moved
         self.p -= by_jp @ by_jp.transpose(0, 2, 1)
         self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
-        log_det = np.log(np.einsum("kii->ki", root)).sum(1)
-        return -0.5 * (by_nu * by_nu).sum((1, 2)) - log_det, moved
+        log_det = np.log(root.reshape(len(root), -1)[:, :: root.shape[1] + 1]).sum(1)
+        return -0.5 * (by_nu * by_nu)[:, :, 0].sum(1) - log_det, moved
 
     def upright(self) -> None:
         """A level field of negative strength points the other way: the same, said as everybody says it."""
@@ -234,7 +234,9 @@ class Bank:
         """Better foretold, more believed; old merit fades, so that a model can come back."""
         fade = math.exp(-dt_s / n.forget_s)
         weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
-        weight -= _ASTRAY * (np.abs(self.x[:, at.S]).max(1) > n.soft_most)
+        for i, soft in enumerate(self.x[:, at.S].tolist()):
+            if max(soft) > n.soft_most or min(soft) < -n.soft_most:
+                weight[i] -= _ASTRAY
         self.log_weight = np.maximum(weight - weight.max(), _LEAST)
 
     def tidy(self, n: Tuning, most: int) -> None:

@@ -132,22 +132,33 @@ def adapt(bank: Bank, inside: Array, mean_white: Array, mean_share: Array, dt_s:
     inside (K, n, k) : innovations less their mean over the block.  mean_white (K, k) : that mean, whitened, clipped.
     mean_share (K, k) : how much of that mean's variance is the block's own noise.
     """
-    weight, k = min(dt_s / 5.0, 0.2), mean_white.shape[1]
-    square = mean_white * mean_white
-    bank.square += weight * (square.sum(1) / k - bank.square)
-    bank.product += weight * ((mean_white * bank.last[:, :k]).sum(1) / k - bank.product)
-    bank.last[:, :k] = mean_white
+    weight, (size, k) = min(dt_s / 5.0, 0.2), inside.shape[1:]
     bank.seen_s += dt_s
     rate = min(dt_s / min(max(0.5 * bank.seen_s, n.adapt_first_s), n.adapt_s), 0.3)
-    if inside.shape[1] > 2:
-        inside = np.abs(inside).reshape(len(inside), -1)
-        inside.sort(axis=1)
-        size = inside.shape[1]
-        middle = 0.5 * (inside[:, size // 2] + inside[:, (size - 1) // 2])
-        scatter = middle * middle * (_MEDIAN_TO_VARIANCE * size / (size - k))
+    if size > 2:
+        apart = np.abs(inside).reshape(len(inside), -1)
+        apart.sort(axis=1)
+        middle = 0.5 * (apart[:, size * k // 2] + apart[:, (size * k - 1) // 2])
+        scatter = middle * middle * (_MEDIAN_TO_VARIANCE * size / (size - 1))
         bank.white_mg2 += rate * (between(scatter, n.white_lo_mg**2, n.white_hi_mg**2) - bank.white_mg2)
-    push = (mean_share * (square - 1.0)).sum(1) / k
-    like = between(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
-    common, longer = np.exp(rate * between(np.array((push, 4.0 * (like - 0.1))), -1.0, 2.0))
-    bank.common_mg2 = between(bank.common_mg2 * common, n.common_lo_mg**2, n.common_hi_mg**2)
-    bank.disturbance_mg = between(bank.disturbance_mg * longer, n.disturbance_lo_mg, n.disturbance_hi_mg)
+    square = mean_white * mean_white
+    told = np.array((square, mean_white * bank.last[:, :k], mean_share * (square - 1.0))).sum(2) / k
+    bank.last[:, :k] = mean_white
+    bank.square += weight * (told[0] - bank.square)
+    bank.product += weight * (told[1] - bank.product)
+    # Of a few hypotheses in plain numbers: an array of three costs as much as one of three hundred.
+    alike = zip(bank.product.tolist(), bank.square.tolist(), strict=True)
+    longer = [4.0 * (within(product / max(square, 0.1), -1.0, 1.0) - 0.1) for product, square in alike]
+    bank.common_mg2 = _grown(bank.common_mg2, told[2].tolist(), rate, n.common_lo_mg**2, n.common_hi_mg**2)
+    bank.disturbance_mg = _grown(bank.disturbance_mg, longer, rate, n.disturbance_lo_mg, n.disturbance_hi_mg)
+
+
+def _grown(values: Array, pushes: list[float], rate: float, low: float, high: float) -> Array:
+    """Each pushed up or down, by no more than the rate's own share and twice that."""
+    pairs = zip(values.tolist(), pushes, strict=True)
+    return np.array([within(v * math.exp(rate * within(push, -1.0, 2.0)), low, high) for v, push in pairs])
+
+
+def within(value: float, low: float, high: float) -> float:
+    """``between`` for one number."""
+    return min(max(value, low), high)
