@@ -302,7 +302,7 @@ def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = KNOW
     errors of their own, three directions give 3.4 or more in one case of a hundred.
     """
     both, off = a_mg2 + b_mg2, apart_mg
-    if float(np.trace(b_mg2)) > knows_mg**2:
+    if b_mg2.trace() > knows_mg**2:
         variances, ways = np.linalg.eigh(b_mg2)
         ways = ways[:, variances <= knows_mg**2]
         if ways.shape[1] == 0:

@@ -15,7 +15,9 @@ tuning       every chosen number
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,7 +73,7 @@ class AdaptiveEstimator:
         self._drive2 = 0.0  # its variance
         self._drives = (0.0, 0.0)  # both, as of the last block
         self._learnt = 0  # blocks, ever
-        self._answered: tuple[tuple[object, ...], Estimate] | None = None  # and what it rests on
+        self._answered: tuple[tuple[object, ...], Callable[..., Estimate]] | None = None  # and what it rests on
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
@@ -270,16 +272,17 @@ class AdaptiveEstimator:
             return None
         said = None if self._second is None else self._second.opinion(expected)
         level = self._tilting.rms_rad < self.tuning.least_tilt_rad  # it may be the attitude's own noise that tilts
-        rests_on = (self._learnt, said, self._is_stale(), level, expected is None)
+        rests_on = (self._learnt, said, self._is_stale(), level)
         if self._answered is None or self._answered[0] != rests_on:
-            self._answered = rests_on, self._answer(self._bank, expected, level)
-        return replace(self._answered[1], samples=self._samples)
+            self._answered = rests_on, self._answer(self._bank, said, level)
+        return self._answered[1](samples=self._samples)
 
     def __getstate__(self) -> dict[str, Any]:
         """What was answered since the last block is made again when asked."""
         return self.__dict__ | {"_answered": None}
 
-    def _answer(self, bank: Bank, expected: ExpectedField | None, level: bool) -> Estimate:
+    def _answer(self, bank: Bank, said: Estimate | None, level: bool) -> Callable[..., Estimate]:
+        """All but how many samples it rests on. said : the second opinion.  level : has it hardly tilted?"""
         mean, covariance = bank.mixture()
         take = self._take()
         pulled = covariance @ take.T
@@ -299,23 +302,22 @@ class AdaptiveEstimator:
         field_apart = 0.0
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
-        mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
+        mean, iron_mg2, own_mg2, apart = self._joined(bank, said, mean, take, pulled, iron_mg2, own_mg2)
         soft = np.linalg.inv(_EYE3 + soft_matrix(mean[at.S]))
-        said = None if self._second is None else self._second.opinion(expected)
         if slow or self._own_tilt:  # a wrong tilt looks like soft iron to the bank
             if said is not None and not self._is_stale():
                 soft = said.soft_iron_b
             elif slow:
                 soft = _EYE3
-        return Estimate(
+        return partial(
+            Estimate,
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
             covariance_mg2=iron_mg2,
-            own_sigma_mg=vec3(np.sqrt(np.diag(own_mg2)), "sigma"),
+            own_sigma_mg=vec3(np.sqrt(own_mg2.diagonal()), "sigma"),
             horizontal_mg=float(mean[at.H]),
             down_mg=float(mean[at.V]),
             residual_mg=math.sqrt(self._residual_mg2 + self._structure_mg2),
             step_nis=self._nis,
-            samples=self._samples,
             changed_ago_s=self._change.since_s,
             delay_s=float(mean[at.T]),
             soft_iron_b=mat3(soft, "soft iron"),
@@ -340,15 +342,13 @@ class AdaptiveEstimator:
         return self._drives[1] * float(mean[at.K] @ mean[at.K]) * _EYE3
 
     def _joined(
-        self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None
+        self, bank: Bank, said: Estimate | None, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array
     ) -> tuple[Array, Array, Array, float]:
         """State with the second opinion, covariance of the iron and that without the model, and sigmas between both.
 
         take (3, n) : the iron of a state.  pulled (n, 3) : covariance of state and iron.
         """
-        bank, second = self._bank, self._second
-        said = None if second is None else second.opinion(expected)
-        if bank is None or second is None or said is None:
+        if said is None:
             return mean, iron_mg2, own_mg2, 0.0
         off = said.hard_iron_b_mg - take @ mean
         apart = distance(off, iron_mg2, said.covariance_mg2)
@@ -359,9 +359,7 @@ class AdaptiveEstimator:
             less = self.tuning.own_tilt_joined
         else:
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
-        motors = self._motors_mg2(mean)
-        theirs_mg2 = much * known(said.covariance_mg2) + motors
-        mean = mean + less * pulled @ np.linalg.solve(less * iron_mg2 + theirs_mg2, off)
-        iron_mg2 = joined(iron_mg2, theirs_mg2, less)
-        own_mg2 = joined(own_mg2, much * known(own_covariance(said)) + motors, less)
-        return mean, iron_mg2, own_mg2, apart
+        theirs_mg2 = np.array((known(said.covariance_mg2), known(own_covariance(said))))
+        theirs_mg2 = much * theirs_mg2 + self._motors_mg2(mean)
+        (iron_mg2, own_mg2), pull = joined(np.array((iron_mg2, own_mg2)), theirs_mg2, less)
+        return mean + pulled @ (pull[0] @ off), iron_mg2, own_mg2, apart

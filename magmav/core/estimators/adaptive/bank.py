@@ -270,7 +270,7 @@ class Bank:
         x = self.x.copy()
         best = int(np.argmax(w))
         x[:, 0] = x[best, 0] + (x[:, 0] - x[best, 0] + math.pi) % TAU - math.pi
-        mean = w @ x
+        mean: Array = w @ x
         away = x - mean
-        covariance = np.einsum("k,kij->ij", w, self.p) + np.einsum("k,ki,kj->ij", w, away, away)
+        covariance: Array = (w @ self.p.reshape(len(w), -1)).reshape(at.SIZE, at.SIZE) + (away.T * w) @ away
         return mean, covariance
