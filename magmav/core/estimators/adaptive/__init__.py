@@ -36,7 +36,7 @@ from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
-from magmav.core.types import Estimate, Sample, mat3, vec3
+from magmav.core.types import NO_SHAPING, Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
 _DOWN = np.diag((0.0, 0.0, 1.0))
@@ -101,7 +101,9 @@ class AdaptiveEstimator:
         if body_from_own is None:
             body_from_own = body_from_earth(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
         down_b, dt = body_from_own[:, 2], max(s.dt_s, 0.0)
-        z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        z = s.mag_b_mg
+        if s.shaping is not NO_SHAPING:
+            z = s.shaping.matrix @ z + s.shaping.motor_b_mg
         about_down, rate = float(s.rate_b_rads @ down_b) * dt, math.hypot(*s.rate_b_rads.tolist())
         still = s.learn and self._still.step(z, rate, dt) and not len(gathering)
         if still:
