@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.answer import surprise, without_prior
+from magmav.core.estimators.adaptive.answer import inverse3, surprise, without_prior
 from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, means, shared_by_all, smear, soft_matrix
-from magmav.core.estimators.adaptive.opinion import doubt, joined, known, own_covariance, stale
+from magmav.core.estimators.adaptive.opinion import doubt, joined, known, stale, told
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
@@ -74,6 +74,7 @@ class AdaptiveEstimator:
         self._drives = (0.0, 0.0)  # both, as of the last block
         self._learnt = 0  # blocks, ever
         self._answered: tuple[tuple[object, ...], Callable[..., Estimate]] | None = None  # and what it rests on
+        self._told: tuple[Estimate, Array] | None = None  # by the second opinion
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
@@ -281,7 +282,7 @@ class AdaptiveEstimator:
 
     def __getstate__(self) -> dict[str, Any]:
         """What was answered since the last block is made again when asked."""
-        return self.__dict__ | {"_answered": None}
+        return self.__dict__ | {"_answered": None, "_told": None}
 
     def _answer(self, bank: Bank, said: Estimate | None, level: bool) -> Callable[..., Estimate]:
         """All but how many samples it rests on. said : the second opinion.  level : has it hardly tilted?"""
@@ -305,7 +306,7 @@ class AdaptiveEstimator:
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
         mean, iron_mg2, own_mg2, apart = self._joined(bank, said, mean, take, pulled, iron_mg2, own_mg2)
-        soft = np.linalg.inv(_EYE3 + soft_matrix(mean[at.S]))
+        soft = inverse3(_EYE3 + soft_matrix(mean[at.S]))
         if slow or self._own_tilt:  # a wrong tilt looks like soft iron to the bank
             if said is not None and not self._is_stale():
                 soft = said.soft_iron_b
@@ -361,7 +362,8 @@ class AdaptiveEstimator:
             less = self.tuning.own_tilt_joined
         else:
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
-        theirs_mg2 = np.array((known(said.covariance_mg2), known(own_covariance(said))))
-        theirs_mg2 = much * theirs_mg2 + self._motors_mg2(mean)
+        if self._told is None or self._told[0] is not said:
+            self._told = said, told(said)
+        theirs_mg2 = much * self._told[1] + self._motors_mg2(mean)
         (iron_mg2, own_mg2), pull = joined(np.array((iron_mg2, own_mg2)), theirs_mg2, less)
         return mean + pulled @ (pull[0] @ off), iron_mg2, own_mg2, apart

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from magmav.core.estimators.adaptive.answer import inverse3
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.twostep import KNOWS_MG, TwostepEstimator
 from magmav.core.types import Estimate
@@ -35,7 +36,7 @@ def joined(ours_mg2: Array, theirs_mg2: Array, less: float) -> tuple[Array, Arra
     What is claimed is ours as it is (Joseph's form): who learns nothing from the second claims no more and no less.
     And (n, 3, 3): what times the covariance of a state and our iron takes the difference of the two to the state.
     """
-    pull = less * np.linalg.inv(less * ours_mg2 + theirs_mg2)
+    pull = less * np.array([inverse3(one) for one in less * ours_mg2 + theirs_mg2])
     gain = ours_mg2 @ pull
     left = _EYE3 - gain
     both = left @ ours_mg2 @ left.swapaxes(1, 2) + gain @ theirs_mg2 @ gain.swapaxes(1, 2)
@@ -52,6 +53,11 @@ def known(iron_mg2: Array) -> Array:
     variances, ways = np.linalg.eigh(iron_mg2)
     out: Array = (ways * np.where(variances > KNOWS_MG**2, _NOTHING_MG2, variances)) @ ways.T
     return out
+
+
+def told(second: Estimate) -> Array:
+    """What is ``known`` of it with everything used and as if the field's length had not been known, (2, 3, 3) mG^2."""
+    return np.array((known(second.covariance_mg2), known(own_covariance(second))))
 
 
 def own_covariance(second: Estimate) -> Array:
