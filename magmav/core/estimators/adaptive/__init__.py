@@ -277,15 +277,15 @@ class AdaptiveEstimator:
         level = self._tilting.rms_rad < self.tuning.least_tilt_rad  # it may be the attitude's own noise that tilts
         rests_on = (self._learnt, said, self._is_stale(), level)
         if self._answered is None or self._answered[0] != rests_on:
-            self._answered = rests_on, self._answer(self._bank, said, level)
+            self._answered = rests_on, self._answer(self._bank, expected, level)
         return self._answered[1](samples=self._samples)
 
     def __getstate__(self) -> dict[str, Any]:
         """What was answered since the last block is made again when asked."""
         return self.__dict__ | {"_answered": None, "_told": None}
 
-    def _answer(self, bank: Bank, said: Estimate | None, level: bool) -> Callable[..., Estimate]:
-        """All but how many samples it rests on. said : the second opinion.  level : has it hardly tilted?"""
+    def _answer(self, bank: Bank, expected: ExpectedField | None, level: bool) -> Callable[..., Estimate]:
+        """All but how many samples it rests on. level : has it hardly tilted?"""
         mean, covariance = bank.mixture()
         take = self._take()
         pulled = covariance @ take.T
@@ -305,9 +305,10 @@ class AdaptiveEstimator:
         field_apart = 0.0
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
-        mean, iron_mg2, own_mg2, apart = self._joined(bank, said, mean, take, pulled, iron_mg2, own_mg2)
+        mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
         soft = inverse3(_EYE3 + soft_matrix(mean[at.S]))
         if slow or self._own_tilt:  # a wrong tilt looks like soft iron to the bank
+            said = None if self._second is None else self._second.opinion(expected)
             if said is not None and not self._is_stale():
                 soft = said.soft_iron_b
             elif slow:
@@ -345,13 +346,14 @@ class AdaptiveEstimator:
         return self._drives[1] * float(mean[at.K] @ mean[at.K]) * _EYE3
 
     def _joined(
-        self, bank: Bank, said: Estimate | None, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array
+        self, mean: Array, take: Array, pulled: Array, iron_mg2: Array, own_mg2: Array, expected: ExpectedField | None
     ) -> tuple[Array, Array, Array, float]:
         """State with the second opinion, covariance of the iron and that without the model, and sigmas between both.
 
         take (3, n) : the iron of a state.  pulled (n, 3) : covariance of state and iron.
         """
-        if said is None:
+        bank, said = self._bank, None if self._second is None else self._second.opinion(expected)
+        if bank is None or said is None:
             return mean, iron_mg2, own_mg2, 0.0
         off = said.hard_iron_b_mg - take @ mean
         apart = distance(off, iron_mg2, said.covariance_mg2)
