@@ -26,6 +26,7 @@ from magmav.core.estimators.twostep_solve import Priors, Stretch, cost, length_o
 from magmav.core.estimators.twostep_window import UNIT_MG, Array, Blocks, Cells, Sieve
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import level_from_body
+from magmav.core.threes import inverse3, squared_distance
 from magmav.core.types import IDENTITY3, NO_SHAPING, Estimate, Sample, mat3, vec3
 
 _WILD_MG = 2e4
@@ -101,7 +102,7 @@ class TwostepEstimator:
             moved = self._covariance[C, C] + np.eye(3) * (self.tuning.moved_mg / UNIT_MG) ** 2
             self._x = np.concatenate((turn @ self._x[C], self._x[3:4], np.zeros(6)))
             self._priors = replace(self._priors, centre=self._x[C].copy(), info=np.linalg.inv(turn @ moved @ turn.T))
-        self._matrix, self._back = mat3(matrix, "matrix"), np.linalg.inv(matrix)
+        self._matrix, self._back = mat3(matrix, "matrix"), inverse3(matrix)
         self._stretch, self._said, self._seen, self._spread = None, None, 0, np.zeros((3, 3))
         self._sieve, self._blocks = Sieve(), Blocks()
 
@@ -319,18 +320,4 @@ def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = KNOW
         if ways.shape[1] == 0:
             return 0.0
         both, off = ways.T @ both @ ways, ways.T @ apart_mg
-    return math.sqrt(max(squared_distance(off.tolist(), both.tolist()), 0.0))
-
-
-def squared_distance(off: list[float], covariance: list[list[float]]) -> float:
-    """off' covariance^-1 off, by elimination in plain numbers: of three, a fifth of what numpy takes."""
-    total, off, rest = 0.0, list(off), [list(row) for row in covariance]
-    while off:
-        a, pivot = off.pop(), rest.pop()
-        total += a * a / pivot[-1]
-        for i, row in enumerate(rest):
-            share = row.pop() / pivot[-1]
-            off[i] -= share * a
-            for j in range(len(row)):
-                row[j] -= share * pivot[j]
-    return total
+    return math.sqrt(max(squared_distance(off, both), 0.0))

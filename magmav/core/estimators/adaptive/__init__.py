@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from magmav.core.estimators.adaptive import layout as at
-from magmav.core.estimators.adaptive.answer import inverse3, surprise, without_prior
+from magmav.core.estimators.adaptive.answer import surprise, without_prior
 from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
@@ -36,6 +36,7 @@ from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
+from magmav.core.threes import inverse3
 from magmav.core.types import NO_SHAPING, Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)

@@ -52,14 +52,3 @@ def inverse2(a: float, b: float, c: float) -> tuple[tuple[float, float], tuple[f
     """Of the symmetric matrix a b, b c."""
     d = a * c - b * b
     return (c / d, -b / d), (-b / d, a / d)
-
-
-def inverse3(matrix: Array) -> Array:
-    """Of a (3, 3) matrix, by its cofactors: half of what numpy takes, which asks a lot before it reckons."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
-    out: Array = np.array(
-        ((p, c * h - b * i, b * f - c * e), (q, a * i - c * g, c * d - a * f), (r, b * g - a * h, a * e - b * d))
-    )
-    out /= a * p + b * q + c * r
-    return out

@@ -216,8 +216,8 @@ class Bank:
 
     def share(self, model: Model) -> float:
         """How much one model is believed."""
-        w, wanted = self.weights().tolist(), MODELS.index(model)
-        return sum(one for one, m in zip(w, self.model.tolist(), strict=True) if m == wanted)
+        wanted = self.model == MODELS.index(model)
+        return float(self.weights() @ wanted)
 
     def kept(self, rows: Index) -> Bank:
         """A bank of these alone."""

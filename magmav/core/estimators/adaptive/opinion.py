@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from magmav.core.estimators.adaptive.answer import inverse3
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.twostep import KNOWS_MG, TwostepEstimator
+from magmav.core.threes import inverse3
 from magmav.core.types import Estimate
 
 _EYE3 = np.eye(3)
