@@ -98,8 +98,7 @@ class Blocks:
         self._standing: list[Block] = []
         self._now: Block | None = None
         self._where = Where.AIR
-        self._rows = np.zeros((_BATCH, WIDTH))
-        self._filled = 0
+        self._rows: list[tuple[float, ...]] = []
         self._yaw_rad = 0.0
         self._chained = False
         self._was: Vector | None = None
@@ -169,16 +168,15 @@ class Blocks:
             turn = s.rate_b_rads.tolist()
             down, first, second = (_turned(v, turn, delay_s) for v in (down, first, second))
         level, t = (*first, *second), boot_s - block.middle_s
-        self._rows[self._filled] = (*down, *level, *(t * v for v in level), 1.0, *power, *z)
-        self._filled += 1
-        if self._filled == _BATCH:
+        self._rows.append((*down, *level, *[t * v for v in level], 1.0, *power, *z))
+        if len(self._rows) == _BATCH:
             self._flush()
 
     def _flush(self) -> None:
-        if self._now is not None and self._filled:
-            rows = self._rows[: self._filled]
+        if self._now is not None and self._rows:
+            rows = np.array(self._rows)
             self._now.sums += rows.T @ rows
-        self._filled = 0
+        self._rows = []
 
     def _close(self) -> None:
         self._flush()
@@ -195,7 +193,7 @@ class Blocks:
 
     def _drop(self, boot_s: float) -> None:
         """The iron had changed some time before it was noticed: that time belongs to neither side."""
-        self._filled, self._now = 0, None
+        self._rows, self._now = [], None
         if self.teaching and boot_s - self.teaching[-1].begin_s < BLOCK_S + _NOTICED_S:
             self.teaching.pop()
 

@@ -150,14 +150,15 @@ class _Problem:
 
     def misfit(self, theta: Array) -> float:
         """Sum of squared residuals, mG^2; theta (J, F, 3)."""
-        return self.square - float(np.einsum("jfr,jfr->", theta, 2.0 * self.y - self.x @ theta))
+        return self.square - float(theta.ravel() @ (2.0 * self.y - self.x @ theta).ravel())
 
     def normal(self, by: Array, theta: Array) -> tuple[Array, Array]:
         """Normal matrices (J, P, P) and right sides (J, P), from derivatives by (J, P, F, 3)."""
-        through = np.einsum("jfg,jpgr->jpfr", self.x, by, optimize=True)
-        flat, j, p = by.reshape(*by.shape[:2], -1), by.shape[0], by.shape[1]
-        matrix = flat @ through.reshape(j, p, -1).transpose(0, 2, 1)
-        return matrix, np.einsum("jpfr,jfr->jp", by, self.y - self.x @ theta, optimize=True)
+        j, p, f, axes = by.shape
+        through = (self.x @ by.transpose(0, 2, 1, 3).reshape(j, f, p * axes)).reshape(j, f, p, axes)
+        flat, left = by.reshape(j, p, f * axes), self.y - self.x @ theta
+        matrix = flat @ through.transpose(0, 1, 3, 2).reshape(j, f * axes, p)
+        return matrix, (flat @ left.reshape(j, f * axes, 1))[:, :, 0]
 
     def inflation(self, theta: Array, variance: float) -> float:
         """How many samples are worth one: residuals that go one way through a block are no separate news."""
@@ -186,10 +187,11 @@ def _linear(p: _Problem, turn: Array, variance: float) -> tuple[float, Array, Ar
     size = 10 + 2 * j
     whole, side = np.zeros((size, size)), np.zeros(size)
     whole[:10, :10], side[:10] = matrix[:, :10, :10].sum(axis=0), right[:, :10].sum(axis=0)
-    for i in range(j):
-        own = slice(10 + 2 * i, 12 + 2 * i)
-        whole[:10, own], whole[own, :10] = matrix[i, :10, 10:], matrix[i, 10:, :10]
-        whole[own, own], side[own] = matrix[i, 10:, 10:], right[i, 10:]
+    whole[:10, 10:] = matrix[:, :10, 10:].transpose(1, 0, 2).reshape(10, 2 * j)
+    whole[10:, :10], side[10:] = whole[:10, 10:].T, right[:, 10:].ravel()
+    level = np.zeros((j, 2, j, 2))
+    np.einsum("iaib->iab", level)[:] = matrix[:, 10:, 10:]
+    whole[10:, 10:] = level.reshape(2 * j, 2 * j)
     v, v_sigma = (0.0, _FIELD_MG * 2.0) if p.expected is None else (p.expected.down_mg, 0.3 * p.expected.total_mg)
     k_sigma = _POWER.get(p.power_by, 1.0)
     sigmas = [v_sigma, *[_IRON_MG] * 3, *[k_sigma] * 3, *[_IRON_MG] * 3, *[_FIELD_MG] * (2 * j)]
@@ -197,9 +199,8 @@ def _linear(p: _Problem, turn: Array, variance: float) -> tuple[float, Array, Ar
     prior = np.zeros(size)
     prior[0] = v
     answer = np.linalg.solve(whole / variance + np.diag(weights), side / variance + weights * prior)
-    theta = np.einsum("jpfr,jp->jfr", by, np.hstack([np.tile(answer[:10], (j, 1)), answer[10:].reshape(j, 2)]))
     fields = np.array(answer[10:], dtype=np.float64).reshape(j, 2)
-    return p.misfit(theta), np.array(answer[:10], dtype=np.float64), fields
+    return p.square - float(answer @ (2.0 * side - whole @ answer)), np.array(answer[:10], dtype=np.float64), fields
 
 
 class _State:
@@ -359,12 +360,10 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
         information, side = _prior(p, state)
         information[:SHARED, :SHARED] += matrix[:, :SHARED, :SHARED].sum(axis=0) / worth
         side[:SHARED] += right[:, :SHARED].sum(axis=0) / worth
-        for i in range(p.blocks):
-            own = SHARED + i
-            information[:SHARED, own] += matrix[i, :SHARED, SHARED] / worth
-            information[own, :SHARED] += matrix[i, SHARED, :SHARED] / worth
-            information[own, own] += matrix[i, SHARED, SHARED] / worth
-            side[own] += right[i, SHARED] / worth
+        information[:SHARED, SHARED:] += matrix[:, :SHARED, SHARED].T / worth
+        information[SHARED:, :SHARED] += matrix[:, SHARED, :SHARED] / worth
+        np.einsum("ii->i", information)[SHARED:] += matrix[:, SHARED, SHARED] / worth
+        side[SHARED:] += right[:, SHARED] / worth
         covariance: Array = np.linalg.inv(information).astype(np.float64)
         step = covariance @ side
         step *= min(1.0, 0.5 / max(float(np.abs(step[TURN]).max()), float(np.abs(step[SHARED:]).max()), 1e-9))

@@ -190,7 +190,7 @@ class Channel:
         """Remember what has been seen, how strong the field is, and where the estimate was."""
         corrected = corrected_field(s, e, expected)
         self._excitation.see(corrected, magnetic_heading(corrected, s.roll_rad, s.pitch_rad))
-        field_mg = float(np.linalg.norm(corrected))
+        field_mg = math.hypot(*corrected.tolist())
         weight = _FIELD_WEIGHT if self._field_mg else 1.0
         self._field_mg += weight * (field_mg - self._field_mg)
         upright = math.cos(s.roll_rad) * math.cos(s.pitch_rad)
@@ -207,10 +207,10 @@ class Channel:
     def _steady(self, boot_ns: int, e: Estimate, sigma_mg: Vec3) -> bool:
         if not self._past or boot_ns - self._past[0][0] < self.steady_s * 1e9 * 0.9:
             return False
-        moved = np.abs(e.hard_iron_b_mg - self._past[0][1])
         states = gate.axis_states(e.own_sigma_mg, sigma_mg, self.limits.axis_sigma_mg)
-        written = [state is not AxisState.NOT_OBSERVED for state in states]
-        return bool((moved <= 2.0 * sigma_mg + 3.0)[[True, True, written[2]]].all())
+        moved = np.abs(e.hard_iron_b_mg - self._past[0][1]) <= 2.0 * sigma_mg + 3.0
+        x, y, z = moved.tolist()
+        return bool(x and y and (z or states[2] is AxisState.NOT_OBSERVED))
 
     def _left(self, e: Estimate | None, c: Circumstances, sigma_mg: Vec3) -> float:
         """What the tilt would make, level, of a down axis that stays as it is stored, mG; 0 where it is written."""

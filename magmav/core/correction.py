@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from magmav.core.dip import dip_from_model
 from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
 from magmav.core.heading import UNKNOWN, heading
 from magmav.core.rotation import euler_rates, wrap_tau
+from magmav.core.threes import inverse3
 from magmav.core.two_axis import Doubts, down_from_dip, heading_of_two_axes, vertical_component
 from magmav.core.types import IDENTITY3, NO_SHAPING, Estimate, Heading, Mat3, Sample, Shaping, Vec3, mat3, vec3
 
@@ -52,8 +54,9 @@ def iron_of_offsets(s: Sample, e: Estimate, expected: ExpectedField | None) -> V
     """
     if e.soft_iron_b is IDENTITY3:
         return e.hard_iron_b_mg
-    down_b = np.array((0.0, 0.0, field_of(e, expected)[1]))
-    bent = np.linalg.solve(e.soft_iron_b, down_b) - down_b
+    down_mg = field_of(e, expected)[1]
+    bent: NDArray[np.floating[Any]] = inverse3(e.soft_iron_b)[:, 2] * down_mg
+    bent[2] -= down_mg
     if s.shaping.matrix is not IDENTITY3:
         bent = np.linalg.solve(s.shaping.matrix, bent)
     return vec3(e.hard_iron_b_mg + bent, "hard iron")

@@ -70,14 +70,15 @@ NOTHING = Verdict(State.NO_DATA, (AxisState.NOT_OBSERVED,) * 3, (Reason.NO_COMPA
 
 def axis_states(own_sigma_mg: Vec3, sigma_mg: Vec3, limit_mg: float) -> tuple[AxisState, AxisState, AxisState]:
     """State of each axis from its sigma by motion alone and with the model."""
-
-    def one(own: float, all_in: float) -> AxisState:
-        if own <= limit_mg:
-            return AxisState.OBSERVED
-        return AxisState.FROM_MODEL if all_in <= limit_mg else AxisState.NOT_OBSERVED
-
-    x, y, z = (one(float(o), float(s)) for o, s in zip(own_sigma_mg, sigma_mg, strict=True))
+    both = zip(own_sigma_mg.tolist(), sigma_mg.tolist(), strict=True)
+    x, y, z = [_axis_state(own, all_in, limit_mg) for own, all_in in both]
     return x, y, z
+
+
+def _axis_state(own_mg: float, all_in_mg: float, limit_mg: float) -> AxisState:
+    if own_mg <= limit_mg:
+        return AxisState.OBSERVED
+    return AxisState.FROM_MODEL if all_in_mg <= limit_mg else AxisState.NOT_OBSERVED
 
 
 def judge(e: Evidence, limits: Limits, was: State) -> Verdict:
@@ -170,7 +171,8 @@ def _notes(e: Evidence) -> tuple[Reason, ...]:
 
 def floored(estimate: Estimate) -> Vec3:
     """Claimed sigma per axis, mG: never under what no field test has ever shown (estimation.md, upload rule)."""
-    own = np.sqrt(np.maximum(np.diag(estimate.covariance_mg2), 0.0))
-    out = np.array([math.hypot(float(s), f) for s, f in zip(own, estimate.floor_mg, strict=True)])
-    out.flags.writeable = False
+    variances = estimate.covariance_mg2.diagonal().tolist()
+    own = [math.hypot(math.sqrt(max(v, 0.0)), f) for v, f in zip(variances, estimate.floor_mg, strict=True)]
+    out = np.array(own)
+    out.setflags(write=False)
     return out

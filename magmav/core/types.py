@@ -35,9 +35,9 @@ def vec3(value: object, name: str) -> Vec3:
 def mat3(value: object, name: str) -> Mat3:
     """A finite, read-only float64 array of shape (3, 3); ValueError naming the culprit otherwise."""
     out = np.array(value, dtype=np.float64)
-    if out.shape != (3, 3) or not np.isfinite(out).all():
+    if out.shape != (3, 3) or not all(map(math.isfinite, out.ravel().tolist())):
         raise ValueError(f"{name}: want a finite 3 x 3 matrix, got {value!r}")
-    out.flags.writeable = False
+    out.setflags(write=False)
     return out
 
 

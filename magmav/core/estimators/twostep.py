@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from magmav.core.estimators.twostep_solve import Priors, Stretch, cost, length_o
 from magmav.core.estimators.twostep_window import UNIT_MG, Array, Blocks, Cells, Sieve
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import level_from_body
+from magmav.core.threes import inverse3, squared_distance
 from magmav.core.types import IDENTITY3, NO_SHAPING, Estimate, Sample, mat3, vec3
 
 _WILD_MG = 2e4
@@ -35,6 +37,7 @@ _SAME_MG = 0.1  # lengths
 KNOWS_MG = 60.0
 """One sigma: who is less sure of a direction than this cannot contradict there."""
 _FOREVER_S = 1e9
+_EYE3 = np.eye(3)
 
 
 class TwostepEstimator:
@@ -42,7 +45,8 @@ class TwostepEstimator:
 
     def __init__(self, tuning: Tuning | None = None) -> None:
         self.tuning = tuning or Tuning()
-        self._shaping, self._matrix, self._plain = NO_SHAPING, IDENTITY3, True
+        self._shaping, self._plain = NO_SHAPING, True
+        self._matrix, self._back = IDENTITY3, IDENTITY3  # and its inverse
         self._sieve, self._blocks = Sieve(), Blocks()
         self._noise = Noise(self.tuning)
         n = self.tuning
@@ -98,7 +102,7 @@ class TwostepEstimator:
             moved = self._covariance[C, C] + np.eye(3) * (self.tuning.moved_mg / UNIT_MG) ** 2
             self._x = np.concatenate((turn @ self._x[C], self._x[3:4], np.zeros(6)))
             self._priors = replace(self._priors, centre=self._x[C].copy(), info=np.linalg.inv(turn @ moved @ turn.T))
-        self._matrix = mat3(matrix, "matrix")
+        self._matrix, self._back = mat3(matrix, "matrix"), inverse3(matrix)
         self._stretch, self._said, self._seen, self._spread = None, None, 0, np.zeros((3, 3))
         self._sieve, self._blocks = Sieve(), Blocks()
 
@@ -133,7 +137,7 @@ class TwostepEstimator:
         self._evidence(P)
         P[C, C] += self._spread
         self._covariance = P
-        begun_s = float(self._blocks.begun_s[-1 - k])
+        begun_s = self._blocks.begun_s[-1 - k]
         was, now = self._now_s - self._begun_s, self._now_s - begun_s
         if now < 0.5 * was and was > 10.0:
             self._changed_s = self._now_s
@@ -166,7 +170,7 @@ class TwostepEstimator:
         n_block = self._blocks.sums[::-1, 0, 0]
         misfit = (dx @ means[:, :4].T + means[:, 4]) * np.sqrt(f / n_block)
         K = len(sums)
-        misfit *= np.tril(np.ones((K, K)))
+        misfit *= _until(K)
         alike = np.maximum((misfit[:, 1:] * misfit[:, :-1]).sum(1), 0.0)
         own2 = ((misfit * misfit).sum(1) + 2.0 * alike) / np.maximum(np.arange(-2, K - 2), 1)
         own2[:4] = 0.0
@@ -204,7 +208,7 @@ class TwostepEstimator:
         """Renew the size of the soft iron: squares of its entries against how many of them the data have decided."""
         assert self._x is not None
         n = self.tuning
-        decided = max(float((1.0 - 0.25 * np.diag(P)[D] / self._priors.soft2).sum()), 0.0)
+        decided = max(float((1.0 - 0.25 * P.diagonal()[D] / self._priors.soft2).sum()), 0.0)
         squares = float((self._x[D] ** 2 / (4.0 * self._soft_scale)).sum())
         soft2 = min((n.soft_weight * n.soft**2 + squares) / (n.soft_weight + decided), n.soft_most**2)
         self._priors = replace(self._priors, soft2=soft2 * self._soft_scale)
@@ -213,7 +217,7 @@ class TwostepEstimator:
         """Where down was, only to say how the field divides into horizontal and down: nothing is learnt from it."""
         down = s.body_from_own[:, 2] if s.body_from_own is not None else level_from_body(s.roll_rad, s.pitch_rad)[2]
         self._seen += 1
-        self._down = self._down + (np.outer(down, point) - self._down) / min(self._seen, 60)
+        self._down = self._down + (down[:, None] * point - self._down) / min(self._seen, 60)
 
     @property
     def reaches_back_s(self) -> float:
@@ -252,21 +256,22 @@ class TwostepEstimator:
             priors = replace(priors, length=length, length_sigma=sigma)
             x, P = solved(x, got, priors, self._noise.white2, 4)
             P[C, C] += self._spread
-        blind = P
-        told = priors.length_info(x) - replace(priors, length_sigma=self._length(None)[1]).length_info(x)
+        blind = P[C, C]
+        told = priors.length_info(x) - priors.length_info(x, self._length(None)[1])
         if told > 0.0:  # the model's word taken back, as a measurement can be
-            blind = P + np.outer(P[:, RHO], P[:, RHO]) / max(1.0 / told - float(P[RHO, RHO]), 1e-9)
-        bent = self._bent(got.sums, x, P[C, C]) + np.eye(3) * (got.structure2 + 3.0 * self._noise.alarm2)
-        back = np.linalg.inv(self._matrix)
+            of_length = P[C, RHO]
+            blind = blind + of_length[:, None] * of_length / max(1.0 / told - float(P[RHO, RHO]), 1e-9)
+        bent = self._bent(got.sums, x, P[C, C]) + _EYE3 * (got.structure2 + 3.0 * self._noise.alarm2)
+        back = self._back
         covariance = back @ (P[C, C] + bent) @ back.T * UNIT_MG**2
-        own = back @ (blind[C, C] + bent) @ back.T * UNIT_MG**2
+        own = back @ (blind + bent) @ back.T * UNIT_MG**2
         soft = soft_root(x)
         down = float((self._down[:, :3] * soft).sum() - self._down[:, 3] @ (soft @ x[C]))
         left2 = self._noise.white2 + got.structure2
         return Estimate(
             hard_iron_b_mg=vec3(back @ x[C] * UNIT_MG, "hard iron"),
             covariance_mg2=0.5 * (covariance + covariance.T),
-            own_sigma_mg=vec3(np.sqrt(np.diag(own)), "sigma"),
+            own_sigma_mg=vec3(np.sqrt(own.diagonal()), "sigma"),
             horizontal_mg=math.sqrt(max(length_of(x) ** 2 - down * down, 0.0)) * UNIT_MG,
             down_mg=down * UNIT_MG,
             residual_mg=math.sqrt(left2) * UNIT_MG,
@@ -283,12 +288,19 @@ class TwostepEstimator:
         Across the line of sight u the centre may be off by t; then it is t^2 / 2 |B| off along it.
         """
         sight = sums[0, 1:4] / sums[0, 0] - x[C]
-        u = sight / max(float(np.linalg.norm(sight)), 1e-9)
-        across = np.eye(3) - np.outer(u, u)
+        u = sight / max(math.hypot(*sight.tolist()), 1e-9)
+        along: Array = u[:, None] * u
+        across = _EYE3 - along
         T = across @ P @ across
-        wide = float(np.trace(T))
+        wide = float(T.trace())
         size2 = (2.0 * float((T * T).sum()) + wide * wide) / (4.0 * length_of(x) ** 2)
-        return np.outer(u, u) * size2
+        return along * size2
+
+
+@cache
+def _until(k: int) -> Array:
+    """(k, k): one where a block, the latest first, is part of a stretch."""
+    return np.tril(np.ones((k, k)))
 
 
 def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = KNOWS_MG) -> float:
@@ -302,10 +314,10 @@ def distance(apart_mg: Array, a_mg2: Array, b_mg2: Array, knows_mg: float = KNOW
     errors of their own, three directions give 3.4 or more in one case of a hundred.
     """
     both, off = a_mg2 + b_mg2, apart_mg
-    if float(np.trace(b_mg2)) > knows_mg**2:
+    if b_mg2.trace() > knows_mg**2:
         variances, ways = np.linalg.eigh(b_mg2)
         ways = ways[:, variances <= knows_mg**2]
         if ways.shape[1] == 0:
             return 0.0
         both, off = ways.T @ both @ ways, ways.T @ apart_mg
-    return math.sqrt(max(float(off @ np.linalg.solve(both, off)), 0.0))
+    return math.sqrt(max(squared_distance(off, both), 0.0))

@@ -19,9 +19,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from magmav.core.estimators.twostep_window import PAIRS_I, PAIRS_J, Array
+from magmav.core.estimators.twostep_window import Array
 
 STATE = 10
+_EYE3 = np.eye(3)
+_PLACES = np.array(((0, 3, 4), (3, 1, 5), (4, 5, 2)))  # where each entry of D stands among PAIRS
 C, RHO, D = slice(0, 3), 3, slice(4, 10)
 # Of E[gradient] per cell, in s^2 E[J]: of (2 d.n + |n|^2)(J(d + n)) for J of degree 1, 0 and 2 in d.
 _DRAWN = np.array((5.0,) * 3 + (3.0,) + (7.0,) * 6)
@@ -29,9 +31,7 @@ _DRAWN = np.array((5.0,) * 3 + (3.0,) + (7.0,) * 6)
 
 def symmetric(pairs: Array) -> Array:
     """The symmetric (3, 3) matrix of its six entries."""
-    out = np.empty((3, 3))
-    out[PAIRS_I, PAIRS_J] = pairs
-    out[PAIRS_J, PAIRS_I] = pairs
+    out: Array = pairs[_PLACES]
     return out
 
 
@@ -71,6 +71,6 @@ def drawn(mean_jacobian: Array, cells: Array | float, white2: float, size: int =
 
 def soft_root(x: Array) -> Array:
     """I + S, the symmetric root of Q, (3, 3)."""
-    values, vectors = np.linalg.eigh(np.eye(3) + symmetric(x[D]))
+    values, vectors = np.linalg.eigh(_EYE3 + symmetric(x[D]))
     out: Array = (vectors * np.sqrt(np.maximum(values, 0.1))) @ vectors.T
     return out

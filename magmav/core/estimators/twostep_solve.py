@@ -48,9 +48,9 @@ class Priors:
         pull[D] = 0.25 / self.soft2 * x[D]
         return out, pull
 
-    def length_info(self, x: Array) -> float:
-        """Information on rho."""
-        return 1.0 / (2.0 * length_of(x) * self.length_sigma) ** 2
+    def length_info(self, x: Array, sigma: float | None = None) -> float:
+        """Information on rho; with another sigma of the length where one is given."""
+        return 1.0 / (2.0 * length_of(x) * (sigma or self.length_sigma)) ** 2
 
     def cost(self, x: Array) -> float:
         """Squared distance from what was expected, in units of its variance."""

@@ -24,6 +24,7 @@ Point = tuple[float, float, float]
 UNIT_MG = 500.0
 """Sums are kept in this unit, about the length of the field: all their entries are then of one size."""
 PAIRS_I, PAIRS_J = np.array((0, 1, 2, 0, 0, 1)), np.array((0, 1, 2, 1, 2, 2))
+_PAIRS_I, _PAIRS_J = 1 + PAIRS_I, 1 + PAIRS_J  # of w
 SIZE = 11
 """Length of w = (1, y, |y|^2, y_i y_j over PAIRS), what a cell says."""
 
@@ -71,13 +72,13 @@ class Cells(NamedTuple):
 class Blocks:
     """Sums of n w w' over cells of n values, a block each, oldest first.
 
-    sums (J, 11, 11); cells (J,) how many made each; begun_s (J,).
+    sums (J, 11, 11); cells, J numbers: how many made each; begun_s, J times.
     """
 
     def __init__(self) -> None:
         self.sums: Array = np.zeros((0, SIZE, SIZE))
-        self.cells: Array = np.zeros(0)
-        self.begun_s: Array = np.zeros(0)
+        self.cells: list[float] = []
+        self.begun_s: list[float] = []
         self._level: list[int] = []
         self._rows: list[tuple[float, float, float, float, float]] = []
         self._n = 0
@@ -127,12 +128,12 @@ class Blocks:
         mean = np.empty((len(rows), SIZE))
         mean[:, :5] = rows
         mean[:, 0] = 1.0
-        mean[:, 5:] = rows[:, 1 + PAIRS_I] * rows[:, 1 + PAIRS_J]
+        mean[:, 5:] = rows[:, _PAIRS_I] * rows[:, _PAIRS_J]
         self._rows = []
         sums = mean.T @ (mean * weight[:, None])
         self.sums = np.concatenate((self.sums, (0.5 * (sums + sums.T))[None]))
-        self.cells = np.append(self.cells, float(len(rows)))
-        self.begun_s = np.append(self.begun_s, self._block_s)
+        self.cells.append(float(len(rows)))
+        self.begun_s.append(self._block_s)
         self._level.append(0)
         self._merge()
         return Cells(weight, mean)
@@ -150,6 +151,5 @@ class Blocks:
             self.cells[i + 1] += self.cells[i]
             self.begun_s[i + 1] = self.begun_s[i]
             self._level[i + 1] = min(level + 1, LEVELS - 1)
-            kept = np.arange(len(self._level)) != i
-            self.sums, self.cells, self.begun_s = self.sums[kept], self.cells[kept], self.begun_s[kept]
-            del self._level[i]
+            self.sums = np.concatenate((self.sums[:i], self.sums[i + 1 :]))
+            del self.cells[i], self.begun_s[i], self._level[i]

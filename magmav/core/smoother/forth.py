@@ -44,9 +44,6 @@ class Forth(AdaptiveEstimator):
         self._tilt_every_s = float(np.mean(every_s))
         self._drive, self._drive2 = c.driven
 
-    def _begun(self, field: tuple[float, float, float, float], iron_mg: Array | None = None) -> Bank:
-        return Bank.begun(field, self.tuning, iron_mg)  # every model from the first on: the flight is known whole
-
     def go(self, nodes: Nodes, late_s: float) -> None:
         """Over a stretch. late_s : a change is noticed within so long."""
         believed = []
@@ -77,4 +74,4 @@ class Forth(AdaptiveEstimator):
         like._structure_mg2, like._residual_mg2, like._nis = 0.0, residual_mg**2, step_nis
         like._change = copy.copy(self._change)
         like._change.since_s = changed_ago_s
-        return like._answer(bank, None, self._level) if self._samples >= 10 else None
+        return like._answer(bank, None, self._level)(samples=self._samples) if self._samples >= 10 else None

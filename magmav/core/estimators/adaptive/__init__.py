@@ -15,7 +15,9 @@ tuning       every chosen number
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,15 +28,16 @@ from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.block import Block, Gathering
 from magmav.core.estimators.adaptive.change import ChangeWatch
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.measurement import equation, shared_by_all, smear, soft_matrix
-from magmav.core.estimators.adaptive.opinion import doubt, joined, known, own_covariance, stale
+from magmav.core.estimators.adaptive.measurement import equation, means, shared_by_all, smear, soft_matrix
+from magmav.core.estimators.adaptive.opinion import doubt, joined, known, stale, told
 from magmav.core.estimators.adaptive.process import advance
 from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
 from magmav.core.rotation import body_from_earth
-from magmav.core.types import Estimate, Sample, mat3, vec3
+from magmav.core.threes import inverse3
+from magmav.core.types import NO_SHAPING, Estimate, Sample, mat3, vec3
 
 _EYE3 = np.eye(3)
 _DOWN = np.diag((0.0, 0.0, 1.0))
@@ -69,7 +72,8 @@ class AdaptiveEstimator:
         self._drive2 = 0.0  # its variance
         self._drives = (0.0, 0.0)  # both, as of the last block
         self._learnt = 0  # blocks, ever
-        self._answered: tuple[tuple[object, ...], Estimate] | None = None  # and what it rests on
+        self._answered: tuple[tuple[object, ...], Callable[..., Estimate]] | None = None  # and what it rests on
+        self._told: tuple[Estimate, Array] | None = None  # by the second opinion
         self._samples = self._blocks = 0
         self._residual_mg2 = 0.0
         self._residual_n = 0
@@ -97,7 +101,9 @@ class AdaptiveEstimator:
         if body_from_own is None:
             body_from_own = body_from_earth(s.roll_rad, s.pitch_rad, self._own_yaw_rad)
         down_b, dt = body_from_own[:, 2], max(s.dt_s, 0.0)
-        z = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+        z = s.mag_b_mg
+        if s.shaping is not NO_SHAPING:
+            z = s.shaping.matrix @ z + s.shaping.motor_b_mg
         about_down, rate = float(s.rate_b_rads @ down_b) * dt, math.hypot(*s.rate_b_rads.tolist())
         still = s.learn and self._still.step(z, rate, dt) and not len(gathering)
         if still:
@@ -213,29 +219,29 @@ class AdaptiveEstimator:
             self._inverse = np.asarray(np.linalg.inv(self._matrix), dtype=np.float64)
         y, j, of_u = equation(bank.x, block)
         nu = (block.z - y)[..., :k]
+        flat = nu.reshape(count, size * k)
         rows = j[:, :, :k].reshape(count, size * k, at.SIZE)
         jp = rows @ bank.p
         expected = jp @ rows.transpose(0, 2, 1)
         expected += bank.common_mg2[:, None, None] * shared_by_all(size, k)
         expected.reshape(count, -1)[:, :: size * k + 1] += bank.white_mg2[:, None]
-        apart = expected.reshape(count, size, k, size, k)
-        own = np.einsum("kiaib->kiab", apart)
+        own = np.einsum("kiaib->kiab", expected.reshape(count, size, k, size, k))
         own += smear(of_u, block, n.sync_s)[..., :k, :k]
         strange = doubted(own, nu, n.doubt_nis)
-        log_likelihood, moved = bank.learn(expected, jp, nu.reshape(count, size * k))
+        log_likelihood, moved = bank.learn(expected, jp, flat)
         bank.upright()
         bank.weigh(log_likelihood, block.dt_s, n)
         best = int(bank.log_weight.argmax())
-        mean = nu.sum(1) / size
-        variance = np.einsum("kaa->ka", apart.sum(1).sum(2)) / size**2
+        by = means(size, k)
+        mean, variance = flat @ by, (expected @ by * by).sum(1)
         white = between(mean / np.sqrt(variance), -4.0, 4.0)
         strangeness = sum(min(one, _STRANGEST) for one in strange[best].tolist()) / (k * size)
         self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         if self._blocks > n.adapt_after:
             adapt(bank, nu - mean[:, None], white, bank.common_mg2[:, None] / variance, block.dt_s, n)
-            push = bank.x[best, at.D] / bank.disturbance_mg[best]
-            like = float(bank.product[best] / max(bank.square[best], 0.1))
-            changed = self._change.step(white[best], mean[best], like, float(push @ push), self._nis, block.dt_s)
+            disturbance = math.hypot(*bank.x[best, at.D].tolist()) / float(bank.disturbance_mg[best])
+            like = float(bank.product[best]) / max(float(bank.square[best]), 0.1)
+            changed = self._change.step(white[best], mean[best], like, disturbance**2, self._nis, block.dt_s)
             if changed and not self._by_hand:  # in the hand something else is near, more likely than on it
                 self._open(bank, block)
         else:
@@ -264,16 +270,17 @@ class AdaptiveEstimator:
             return None
         said = None if self._second is None else self._second.opinion(expected)
         level = self._tilting.rms_rad < self.tuning.least_tilt_rad  # it may be the attitude's own noise that tilts
-        rests_on = (self._learnt, said, self._is_stale(), level, expected is None)
+        rests_on = (self._learnt, said, self._is_stale(), level)
         if self._answered is None or self._answered[0] != rests_on:
             self._answered = rests_on, self._answer(self._bank, expected, level)
-        return replace(self._answered[1], samples=self._samples)
+        return self._answered[1](samples=self._samples)
 
     def __getstate__(self) -> dict[str, Any]:
         """What was answered since the last block is made again when asked."""
-        return self.__dict__ | {"_answered": None}
+        return self.__dict__ | {"_answered": None, "_told": None}
 
-    def _answer(self, bank: Bank, expected: ExpectedField | None, level: bool) -> Estimate:
+    def _answer(self, bank: Bank, expected: ExpectedField | None, level: bool) -> Callable[..., Estimate]:
+        """All but how many samples it rests on. level : has it hardly tilted?"""
         mean, covariance = bank.mixture()
         take = self._take()
         pulled = covariance @ take.T
@@ -294,22 +301,22 @@ class AdaptiveEstimator:
         if self._model_mg is not None:
             field_apart = surprise(float(mean[at.H]), float(mean[at.V]), self._model_mg, self.tuning)
         mean, iron_mg2, own_mg2, apart = self._joined(mean, take, pulled, iron_mg2, own_mg2, expected)
-        soft = np.linalg.inv(_EYE3 + soft_matrix(mean[at.S]))
-        said = None if self._second is None else self._second.opinion(expected)
+        soft = inverse3(_EYE3 + soft_matrix(mean[at.S]))
         if slow or self._own_tilt:  # a wrong tilt looks like soft iron to the bank
+            said = None if self._second is None else self._second.opinion(expected)
             if said is not None and not self._is_stale():
                 soft = said.soft_iron_b
             elif slow:
                 soft = _EYE3
-        return Estimate(
+        return partial(
+            Estimate,
             hard_iron_b_mg=vec3(take @ mean, "hard iron"),
             covariance_mg2=iron_mg2,
-            own_sigma_mg=vec3(np.sqrt(np.diag(own_mg2)), "sigma"),
+            own_sigma_mg=vec3(np.sqrt(own_mg2.diagonal()), "sigma"),
             horizontal_mg=float(mean[at.H]),
             down_mg=float(mean[at.V]),
             residual_mg=math.sqrt(self._residual_mg2 + self._structure_mg2),
             step_nis=self._nis,
-            samples=self._samples,
             changed_ago_s=self._change.since_s,
             delay_s=float(mean[at.T]),
             soft_iron_b=mat3(soft, "soft iron"),
@@ -340,9 +347,8 @@ class AdaptiveEstimator:
 
         take (3, n) : the iron of a state.  pulled (n, 3) : covariance of state and iron.
         """
-        bank, second = self._bank, self._second
-        said = None if second is None else second.opinion(expected)
-        if bank is None or second is None or said is None:
+        bank, said = self._bank, None if self._second is None else self._second.opinion(expected)
+        if bank is None or said is None:
             return mean, iron_mg2, own_mg2, 0.0
         off = said.hard_iron_b_mg - take @ mean
         apart = distance(off, iron_mg2, said.covariance_mg2)
@@ -353,9 +359,8 @@ class AdaptiveEstimator:
             less = self.tuning.own_tilt_joined
         else:
             much *= 1.0 + self.tuning.plain_doubt * (1.0 - bank.share(HARD)) ** 2
-        motors = self._motors_mg2(mean)
-        theirs_mg2 = much * known(said.covariance_mg2) + motors
-        mean = mean + less * pulled @ np.linalg.solve(less * iron_mg2 + theirs_mg2, off)
-        iron_mg2 = joined(iron_mg2, theirs_mg2, less)
-        own_mg2 = joined(own_mg2, much * known(own_covariance(said)) + motors, less)
-        return mean, iron_mg2, own_mg2, apart
+        if self._told is None or self._told[0] is not said:
+            self._told = said, told(said)
+        theirs_mg2 = much * self._told[1] + self._motors_mg2(mean)
+        (iron_mg2, own_mg2), pull = joined(np.array((iron_mg2, own_mg2)), theirs_mg2, less)
+        return mean + pulled @ (pull[0] @ off), iron_mg2, own_mg2, apart

@@ -177,17 +177,17 @@ class Bank:
         """Kalman's update. The log likelihood (K,), but for a constant, and by how much x moved, (K, n).
 
         nu (K, m) : innovations.  expected (K, m, m) : their covariance.  jp (K, m, n) : Jacobian times p.
-        With expected = L L' all that is wanted comes of L^-1 (J P, nu).
+        With expected = L L' all that is wanted is in the products of the columns of L^-1 (J P, nu).
         """
         root = np.linalg.cholesky(expected)
         white = np.linalg.solve(root, np.concatenate((jp, nu[:, :, None]), 2))
-        by_jp, by_nu = white[:, :, :-1].transpose(0, 2, 1), white[:, :, -1:]
-        moved: Array = (by_jp @ by_nu)[:, :, 0]
+        products = white.transpose(0, 2, 1) @ white
+        moved: Array = products[:, :-1, -1]
         self.x += moved
-        self.p -= by_jp @ by_jp.transpose(0, 2, 1)
-        self.p = 0.5 * (self.p + self.p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
-        log_det = np.log(np.einsum("kii->ki", root)).sum(1)
-        return -0.5 * (by_nu * by_nu).sum((1, 2)) - log_det, moved
+        p = self.p - products[:, :-1, :-1]
+        self.p = 0.5 * (p + p.transpose(0, 2, 1))  # rounding must not grow into asymmetry
+        log_det = np.log(root.reshape(len(root), -1)[:, :: root.shape[1] + 1]).sum(1)
+        return -0.5 * products[:, -1, -1] - log_det, moved
 
     def upright(self) -> None:
         """A level field of negative strength points the other way: the same, said as everybody says it."""
@@ -216,7 +216,8 @@ class Bank:
 
     def share(self, model: Model) -> float:
         """How much one model is believed."""
-        return float(self.weights()[self.model == MODELS.index(model)].sum())
+        wanted = self.model == MODELS.index(model)
+        return float(self.weights() @ wanted)
 
     def kept(self, rows: Index) -> Bank:
         """A bank of these alone."""
@@ -233,9 +234,13 @@ class Bank:
     def weigh(self, log_likelihood: Array, dt_s: float, n: Tuning) -> None:
         """Better foretold, more believed; old merit fades, so that a model can come back."""
         fade = math.exp(-dt_s / n.forget_s)
-        weight = fade * self.log_weight + (1.0 - fade) * self.prior + n.temper * log_likelihood
-        weight -= _ASTRAY * (np.abs(self.x[:, at.S]).max(1) > n.soft_most)
-        self.log_weight = np.maximum(weight - weight.max(), _LEAST)
+        parts = self.log_weight.tolist(), self.prior.tolist(), log_likelihood.tolist(), self.x[:, at.S].tolist()
+        weight = [
+            fade * was + (1.0 - fade) * prior + n.temper * now - (_ASTRAY if max(map(abs, s)) > n.soft_most else 0.0)
+            for was, prior, now, s in zip(*parts, strict=True)
+        ]
+        best = max(weight)
+        self.log_weight = np.array([max(one - best, _LEAST) for one in weight])
 
     def tidy(self, n: Tuning, most: int) -> None:
         """Drop what is not believed, merge what has become the same; the best of each model stays, and few others."""
@@ -268,7 +273,7 @@ class Bank:
         x = self.x.copy()
         best = int(np.argmax(w))
         x[:, 0] = x[best, 0] + (x[:, 0] - x[best, 0] + math.pi) % TAU - math.pi
-        mean = w @ x
+        mean: Array = w @ x
         away = x - mean
-        covariance = np.einsum("k,kij->ij", w, self.p) + np.einsum("k,ki,kj->ij", w, away, away)
+        covariance: Array = (w @ self.p.reshape(len(w), -1)).reshape(at.SIZE, at.SIZE) + (away.T * w) @ away
         return mean, covariance

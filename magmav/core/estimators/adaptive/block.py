@@ -79,13 +79,9 @@ class Gathering:
 
     def __init__(self) -> None:
         self._last: Sample | None = None
-        # Plain numbers: small, saved or not.
-        self._bodies: list[list[list[float]]] = []
-        self._z: list[list[float]] = []
-        self._rates: list[list[float]] = []
-        self._calmed: list[float] = []
-        self._drives: list[float] = []
-        self._downs: list[list[float]] = []  # integral of down_b up to each sample
+        # A row each in plain numbers, small, saved or not: z, integral of down_b up to it, rate, body_from_own, calmed
+        # tilt, drive.
+        self._rows: list[list[float]] = []
         self._dt_s = 0.0
         self._down_s: Array = np.zeros(3)
         self._turn_rad2 = self._turned_rad = 0.0
@@ -93,7 +89,7 @@ class Gathering:
         self._first_s = 0.0
 
     def __len__(self) -> int:
-        return len(self._z)
+        return len(self._rows)
 
     @property
     def span_s(self) -> float:
@@ -125,29 +121,26 @@ class Gathering:
 
     def add(self, s: Sample, z: Array, body_from_own: Array, calmed_rad: float, drive: float) -> None:
         """Take one sample. calmed_rad : tilt that was taken out of its attitude."""
-        if not self._z:
+        if not self._rows:
             self._first_s = self._dt_s
         self._last = s
-        self._z.append(z.tolist())
-        self._bodies.append(body_from_own.tolist())
-        self._rates.append(s.rate_b_rads.tolist())
-        self._calmed.append(calmed_rad)
-        self._drives.append(drive)
-        self._downs.append(self._down_s.tolist())
+        vectors = z.tolist() + self._down_s.tolist() + s.rate_b_rads.tolist()
+        self._rows.append([*vectors, *body_from_own.ravel().tolist(), calmed_rad, drive])
 
     def close(self) -> Block:
         """All of them as one block, and begin anew."""
-        bodies, rates, last = np.array(self._bodies), np.array(self._rates), self._last
+        rows, last = np.array(self._rows), self._last
         assert last is not None  # nobody closes an empty one
-        turns, same = fixed_parts(bodies, rates, last.shaping.matrix, np.array(self._drives))
+        rates, bodies = rows[:, 6:9], rows[:, 9:18].reshape(-1, 3, 3)
+        turns, same = fixed_parts(bodies, rates, last.shaping.matrix, rows[:, 19])
         out = Block(
-            z=np.array(self._z),
+            z=rows[:, :3],
             body_from_own=bodies,
             rate_rads2=(rates * rates).sum(1),
             turns_b=turns,
-            calmed_rad=np.array(self._calmed),
+            calmed_rad=rows[:, 18],
             same=same,
-            ahead_s=self._down_s - np.array(self._downs),
+            ahead_s=self._down_s - rows[:, 3:6],
             dt_s=self._dt_s,
             down_s=self._down_s,
             turn_rad2=self._turn_rad2,

@@ -21,8 +21,7 @@ class ChangeWatch:
 
     def __init__(self, n: Tuning) -> None:
         self._n = n
-        self._mean: Array = np.zeros(3)
-        self._innovation_mg: Array = np.zeros(3)
+        self._mean, self._innovation_mg = [0.0] * 3, [0.0] * 3
         self._alike = 0.0
         self._seen = 0.0  # samples behind the mean, as far as it remembers
         self.since_s = 1e9  # the last change
@@ -37,27 +36,28 @@ class ChangeWatch:
         like : correlation of neighbouring innovations; where they are alike anyway, fewer of them count.
         True when the iron must have changed.
         """
-        n, k = self._n, len(white)
+        n = self._n
         self.since_s += dt_s
         if dt_s <= 0.0:
             return False
         fade = math.exp(-dt_s / n.change_tau_s)
-        self._mean[:k] += (1.0 - fade) * (white - self._mean[:k])
-        self._innovation_mg[:k] += (1.0 - fade) * (innovation_mg - self._innovation_mg[:k])
+        for i, (one, one_mg) in enumerate(zip(white.tolist(), innovation_mg.tolist(), strict=True)):
+            self._mean[i] += (1.0 - fade) * (one - self._mean[i])
+            self._innovation_mg[i] += (1.0 - fade) * (one_mg - self._innovation_mg[i])
         self._alike += min(dt_s / _ALIKE_S, 0.1) * (like - self._alike)  # slowly: a change itself looks alike, too
         self._seen = min(self._seen + 1.0, (1.0 + fade) / (1.0 - fade))
         if self.since_s < n.change_hold_s or self._seen < 5.0:
             return False
         alike = min(max(self._alike, 0.0), 0.9)
-        leaning = float(self._mean @ self._mean) * self._seen * (1.0 - alike) / (1.0 + alike)
+        leaning = math.hypot(*self._mean) ** 2 * self._seen * (1.0 - alike) / (1.0 + alike)
         if leaning < n.change_chi2 and disturbance < n.change_disturbance and nis < n.change_nis:
             return False
         self.since_s = self._seen = 0.0
-        self._mean = np.zeros(3)
+        self._mean = [0.0] * 3
         return True
 
     def open(self, bank: Bank) -> None:
         """Let the iron move: what is known of field, heading and soft iron stays, so it is soon found again."""
-        seen = max(float(np.linalg.norm(self._innovation_mg)), float(np.abs(bank.x[:, at.D]).max(initial=0.0)))
+        seen = max(math.hypot(*self._innovation_mg), float(np.abs(bank.x[:, at.D]).max(initial=0.0)))
         bank.doubt_iron(max(_LEAST_MG, _SHARE * seen))
         np.einsum("kii->ki", bank.p)[:, at.ALPHA] += _TURN_RAD**2

@@ -83,6 +83,12 @@ def shared_by_all(n: int, axes: int) -> Array:
     return np.tile(np.eye(axes), (n, n))
 
 
+@cache
+def means(n: int, axes: int) -> Array:
+    """(n axes, axes): what makes of a block's numbers their mean by axis."""
+    return np.tile(np.eye(axes) / n, (n, 1))
+
+
 def smear(of_u: Array, block: Readings, sync_s: float) -> Array:
     """(K, n, 3, 3) mG^2: what a mismatch in time or tilt does to the field; it never changes the field's length.
 

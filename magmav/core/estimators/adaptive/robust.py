@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from operator import mul
 
 import numpy as np
 
@@ -132,22 +133,32 @@ def adapt(bank: Bank, inside: Array, mean_white: Array, mean_share: Array, dt_s:
     inside (K, n, k) : innovations less their mean over the block.  mean_white (K, k) : that mean, whitened, clipped.
     mean_share (K, k) : how much of that mean's variance is the block's own noise.
     """
-    weight, k = min(dt_s / 5.0, 0.2), mean_white.shape[1]
-    square = mean_white * mean_white
-    bank.square += weight * (square.sum(1) / k - bank.square)
-    bank.product += weight * ((mean_white * bank.last[:, :k]).sum(1) / k - bank.product)
-    bank.last[:, :k] = mean_white
+    weight, (size, k) = min(dt_s / 5.0, 0.2), inside.shape[1:]
     bank.seen_s += dt_s
     rate = min(dt_s / min(max(0.5 * bank.seen_s, n.adapt_first_s), n.adapt_s), 0.3)
-    if inside.shape[1] > 2:
-        inside = np.abs(inside).reshape(len(inside), -1)
-        inside.sort(axis=1)
-        size = inside.shape[1]
-        middle = 0.5 * (inside[:, size // 2] + inside[:, (size - 1) // 2])
-        scatter = middle * middle * (MEDIAN_TO_VARIANCE * size / (size - k))
+    if size > 2:
+        apart = np.abs(inside).reshape(len(inside), -1)
+        apart.sort(axis=1)
+        middle = 0.5 * (apart[:, size * k // 2] + apart[:, (size * k - 1) // 2])
+        scatter = middle * middle * (MEDIAN_TO_VARIANCE * size / (size - 1))
         bank.white_mg2 += rate * (between(scatter, n.white_lo_mg**2, n.white_hi_mg**2) - bank.white_mg2)
-    push = (mean_share * (square - 1.0)).sum(1) / k
-    like = between(bank.product / np.maximum(bank.square, 0.1), -1.0, 1.0)
-    common, longer = np.exp(rate * between(np.array((push, 4.0 * (like - 0.1))), -1.0, 2.0))
-    bank.common_mg2 = between(bank.common_mg2 * common, n.common_lo_mg**2, n.common_hi_mg**2)
-    bank.disturbance_mg = between(bank.disturbance_mg * longer, n.disturbance_lo_mg, n.disturbance_hi_mg)
+    # The rest one hypothesis after the other: to numpy three numbers cost as much as three hundred.
+    own = (mean_white, bank.last, mean_share, bank.square, bank.product, bank.common_mg2, bank.disturbance_mg)
+    out = []
+    for white, last, share, square, product, common, disturbance in zip(*(v.tolist() for v in own), strict=True):
+        squares = [v * v for v in white]
+        square += weight * (sum(squares) / k - square)
+        product += weight * (sum(map(mul, white, last)) / k - product)
+        push = (sum(map(mul, share, squares)) - sum(share)) / k
+        common *= math.exp(rate * within(push, -1.0, 2.0))
+        like = within(product / max(square, 0.1), -1.0, 1.0)
+        disturbance *= math.exp(rate * within(4.0 * (like - 0.1), -1.0, 2.0))
+        common = within(common, n.common_lo_mg**2, n.common_hi_mg**2)
+        out.append((square, product, common, within(disturbance, n.disturbance_lo_mg, n.disturbance_hi_mg)))
+    bank.square, bank.product, bank.common_mg2, bank.disturbance_mg = np.array(out).T.copy()
+    bank.last[:, :k] = mean_white
+
+
+def within(value: float, low: float, high: float) -> float:
+    """``between`` for one number."""
+    return min(max(value, low), high)
