@@ -15,7 +15,7 @@ flight has shaped, instead of about what was believed on the way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,7 +33,8 @@ from magmav.core.smoother.noise import Noise
 from magmav.core.types import Estimate, Sample
 
 _ROUNDS = 3  # about the path of the round before: the third moves nothing by a tenth of its sigma any more
-_LATE_S = 6.0  # a change is noticed within so long
+_LATE_NS = 6_000_000_000  # a change is noticed within so long
+_COARSE = 2  # times as long are the nodes of the forward pass: it only says where to begin
 _WIDE_MG = 100.0  # the iron may step so far where a change was noticed, and more where it did
 _SHARE = 1.5
 _FAR_MG = 60.0
@@ -103,7 +104,15 @@ def smooth(samples: Sequence[Sample], tuning: Tuning | None = None) -> Smoothed 
     if nodes is None or len(nodes) < _LEAST_NODES:
         return None
     forth = Forth(nodes.columns, n)
-    forth.go(nodes, _LATE_S)
+    longer = replace(
+        n,
+        block_s=_COARSE * n.block_s,
+        block_readings=_COARSE * n.block_readings,
+        nodes_most=n.nodes_most // _COARSE,
+    )
+    coarse = Nodes.of(nodes.columns, longer)
+    assert coarse is not None  # what fills fine ones
+    forth.go(coarse, _LATE_NS)
     return _Search(nodes, forth, n).run()
 
 
@@ -114,9 +123,13 @@ class _Search:
         self.nodes, self.forth, self.n = nodes, forth, n
         self.noise = Noise.first(n)
         self.opened = np.zeros(len(nodes) - 1)  # sigma of a step, mG
-        for notice in forth.notices:
-            window = slice(notice.node - notice.lately, notice.node)
-            self.opened[window] = np.maximum(self.opened[window], _WIDE_MG / np.sqrt(notice.lately))
+        boot_ns = nodes.boot_ns
+        self._windows = [
+            slice(*np.searchsorted(boot_ns, (notice.from_ns, notice.to_ns)).clip(0, len(nodes) - 1))
+            for notice in forth.notices
+        ]
+        for w in self._windows:
+            self.opened[w] = np.maximum(self.opened[w], _WIDE_MG / np.sqrt(max(w.stop - w.start, 1)))
         self.x = begin(nodes, forth)
         self.left = np.empty(0)
         at_s = np.cumsum(nodes.dt_s)
@@ -150,14 +163,13 @@ class _Search:
         """Where the iron stepped; found one after the other, each round with the ones before let go."""
         axes, placed = self.nodes.columns.axes, []
         sizes: dict[int, float] = {}
-        for notice in self.forth.notices:
-            window = slice(notice.node - notice.lately, notice.node)
+        for window in self._windows:
             if self._edge[window].all():
                 continue
             moved = np.linalg.norm(np.diff(self._best.passing[:, 1:4], axis=0)[window, :axes], axis=1)
             place = window.start + int(np.argmax(moved))
             sizes[place] = float(moved.max())
-        if self.forth.notices:
+        if self._windows:
             self._let_go(sizes)
             self._round()
         while len(sizes) < _MOST_CHANGES:
@@ -200,13 +212,12 @@ def begin(nodes: Nodes, forth: Forth) -> Array:
 
     Where it noticed changes, the iron of each part as it was known at that part's end.
     """
-    believed = forth.believed
-    x = np.repeat(believed[-1:], len(nodes), axis=0)
+    x = np.repeat(forth.believed[-1:], len(nodes), axis=0)
     x[:, at.E], x[:, at.D] = 0.0, 0.0
-    start = 0
+    start, boot_ns = 0, nodes.boot_ns
     for notice in forth.notices:
-        end = notice.node - notice.lately // 2
-        x[start:end, at.B] = believed[notice.node - notice.lately, at.B]
+        end = int(np.searchsorted(boot_ns, (notice.from_ns + notice.to_ns) // 2))
+        x[start:end, at.B] = forth.at(notice.from_ns)[at.B]
         start = end
     x[:, at.ALPHA] = north(nodes, x)
     return x

@@ -9,6 +9,7 @@ import copy
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.estimators.adaptive import layout as at
@@ -21,17 +22,21 @@ from magmav.core.types import Estimate
 
 
 class Notice(NamedTuple):
-    """The iron changed suddenly before this node, at most so many nodes before."""
+    """The iron changed suddenly between these two times."""
 
-    node: int
-    lately: int
+    from_ns: int
+    to_ns: int
 
 
 class Forth(AdaptiveEstimator):
-    """The estimator fed with nodes. believed (n, SIZE) : by the best hypothesis after each."""
+    """The estimator fed with nodes.
+
+    boot_ns (n,), believed (n, SIZE) : by the best hypothesis after each.
+    """
 
     def __init__(self, c: Columns, tuning: Tuning) -> None:
         super().__init__(tuning, second=False)
+        self.boot_ns: NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self.believed: Array = np.empty((0, at.SIZE))
         self.notices: list[Notice] = []
         first = c.samples[int(np.flatnonzero(c.take)[0])]
@@ -44,26 +49,29 @@ class Forth(AdaptiveEstimator):
         self._tilt_every_s = float(np.mean(every_s))
         self._drive, self._drive2 = c.driven
 
-    def go(self, nodes: Nodes, late_s: float) -> None:
-        """Over a stretch. late_s : a change is noticed within so long."""
-        believed = []
-        at_s = np.concatenate(([0.0], np.cumsum(nodes.dt_s)))
+    def go(self, nodes: Nodes, late_ns: int) -> None:
+        """Over a stretch. late_ns : a change is noticed within so long."""
+        believed, self.boot_ns = [], nodes.boot_ns
         for i, block in enumerate(nodes.blocks()):
             since_s = self._change.since_s
             self._lost = i > 0 and bool(nodes.lost[i - 1])
             self._take_in(block)
             if self._change.since_s < since_s:
-                early = int(np.searchsorted(at_s, at_s[i] - late_s))
-                self.notices.append(Notice(i, i - min(early, i - 1)))
+                self.notices.append(Notice(int(self.boot_ns[i]) - late_ns, int(self.boot_ns[i])))
             assert self._bank is not None
-            believed.append(self._bank.x[int(self._bank.log_weight.argmax())])
+            believed.append(self._bank.x[int(self._bank.log_weight.argmax())].copy())
         self.believed = np.array(believed)
 
+    def at(self, boot_ns: int) -> Array:
+        """What was believed by then, (SIZE,)."""
+        return np.asarray(self.believed[max(int(np.searchsorted(self.boot_ns, boot_ns, side="right")) - 1, 0)])
+
     def first(self, nodes: Nodes) -> Forth:
-        """As it was at the end of these, the first ones of those it went over."""
-        out = copy.copy(self)
-        out.believed = self.believed[: len(nodes)]
-        out.notices = [notice for notice in self.notices if notice.node < len(nodes)]
+        """As it was at the end of these, the first ones of the stretch."""
+        out, end_ns = copy.copy(self), int(nodes.boot_ns[-1])
+        count = max(int(np.searchsorted(self.boot_ns, end_ns, side="right")), 1)
+        out.boot_ns, out.believed = self.boot_ns[:count], self.believed[:count]
+        out.notices = [notice for notice in self.notices if notice.to_ns <= end_ns]
         out._samples = int(nodes.there.sum())
         return out
 
