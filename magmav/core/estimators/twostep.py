@@ -180,7 +180,9 @@ class TwostepEstimator:
         structure2 = np.maximum((left2 - white2) / values, 0.0)
         P = np.linalg.inv(info / value2[:, None, None] + prior[:4, :4])
         claim2 = P[:, 0, 0] + P[:, 1, 1] + P[:, 2, 2] + 3.0 * structure2
-        k = int(np.flatnonzero(claim2 <= self.tuning.slack * claim2.min())[-1])
+        claims2 = claim2.tolist()
+        most = self.tuning.slack * min(claims2)
+        k = max(i for i, claimed2 in enumerate(claims2) if claimed2 <= most)
         return k, Stretch(sums[k], float(cells[k]), float(value2[k]), float(structure2[k]))
 
     def _look_elsewhere(self, x: Array, P: Array, stretch: Stretch) -> tuple[Array, Array]:

@@ -31,7 +31,7 @@ from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.measurement import equation, means, shared_by_all, smear, soft_matrix
 from magmav.core.estimators.adaptive.opinion import doubt, joined, known, stale, told
 from magmav.core.estimators.adaptive.process import advance
-from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted
+from magmav.core.estimators.adaptive.robust import Stillness, Tilting, WildGate, adapt, between, doubted, squares
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, Tuning
 from magmav.core.estimators.twostep import TwostepEstimator, distance
 from magmav.core.field import ExpectedField
@@ -227,7 +227,7 @@ class AdaptiveEstimator:
         expected.reshape(count, -1)[:, :: size * k + 1] += bank.white_mg2[:, None]
         own = np.einsum("kiaib->kiab", expected.reshape(count, size, k, size, k))
         own += smear(of_u, block, n.sync_s)[..., :k, :k]
-        strange = doubted(own, nu, n.doubt_nis)
+        strange = doubted(own, nu, bank.white_mg2 + bank.common_mg2, n.doubt_nis)
         log_likelihood, moved = bank.learn(expected, jp, flat)
         bank.upright()
         bank.weigh(log_likelihood, block.dt_s, n)
@@ -235,7 +235,8 @@ class AdaptiveEstimator:
         by = means(size, k)
         mean, variance = flat @ by, (expected @ by * by).sum(1)
         white = between(mean / np.sqrt(variance), -4.0, 4.0)
-        strangeness = sum(min(one, _STRANGEST) for one in strange[best].tolist()) / (k * size)
+        lone = squares(own[best], nu[best]) if strange is None else strange[best]
+        strangeness = sum(min(one, _STRANGEST) for one in lone.tolist()) / (k * size)
         self._nis += min((2.5 if strangeness > self._nis else 1.0) * block.dt_s, 0.5) * (strangeness - self._nis)
         if self._blocks > n.adapt_after:
             adapt(bank, nu - mean[:, None], white, bank.common_mg2[:, None] / variance, block.dt_s, n)

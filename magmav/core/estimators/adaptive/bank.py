@@ -216,8 +216,9 @@ class Bank:
 
     def share(self, model: Model) -> float:
         """How much one model is believed."""
-        wanted = self.model == MODELS.index(model)
-        return float(self.weights() @ wanted)
+        best, wanted = float(self.log_weight.max()), MODELS.index(model)
+        w = [math.exp(one - best) for one in self.log_weight.tolist()]
+        return sum(one for one, m in zip(w, self.model.tolist(), strict=True) if m == wanted) / sum(w)
 
     def kept(self, rows: Index) -> Bank:
         """A bank of these alone."""

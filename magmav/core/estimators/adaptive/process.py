@@ -15,6 +15,8 @@ from magmav.core.estimators.adaptive.bank import Bank
 from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 
+_ONES = np.ones(at.SIZE)
+
 
 def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt_rad: float | None, n: Tuning) -> None:
     """Carry all hypotheses over dt_s.
@@ -32,7 +34,7 @@ def advance(bank: Bank, dt_s: float, down_s: Array, turn_rad2: float, own_tilt_r
     if own_tilt_rad is not None:
         tilt_rad, tilt_tau_s = min(n.own_tilt_doubt * own_tilt_rad, n.own_tilt_most_rad), n.own_tilt_tau_s
     tilt, short = math.exp(-dt_s / tilt_tau_s), math.exp(-dt_s / n.disturbance_tau_s)
-    fade = np.ones(at.SIZE)
+    fade = _ONES.copy()
     fade[at.E], fade[at.D] = tilt, short
     x *= fade
     p *= fade[:, None] * fade

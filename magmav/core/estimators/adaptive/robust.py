@@ -115,13 +115,20 @@ def between(values: Array, low: float, high: float) -> Array:
     return np.minimum(np.maximum(values, low), high)
 
 
-def doubted(expected: Array, nu: Array, doubt_nis: float) -> Array:
+def squares(expected: Array, nu: Array) -> Array:
+    """Of innovations (..., n, k), normalised by what is expected of each, (..., n, k, k): (..., n)."""
+    return np.asarray((nu * np.linalg.solve(expected, nu[..., None])[..., 0]).sum(-1))
+
+
+def doubted(expected: Array, nu: Array, least_mg2: Array, doubt_nis: float) -> Array | None:
     """Make what is expected of a strange reading as wide as it is strange, in place (Huber's weights).
 
-    expected (K, n, 3, 3) : each reading's own part of the innovation's covariance.  nu (K, n, 3).
-    Their normalised squares before that, (K, n).
+    expected (K, n, k, k) : each reading's own part of the innovation's covariance, in no direction less than least_mg2
+    (K,).  nu (K, n, k).  Their normalised squares before that, (K, n), or None where that alone says that none is.
     """
-    nis: Array = (nu * np.linalg.solve(expected, nu[..., None])[..., 0]).sum(2)
+    if not ((nu * nu).sum(2).max(1) > doubt_nis * least_mg2).any():
+        return None
+    nis = squares(expected, nu)
     if nis.max() > doubt_nis:
         expected *= np.maximum(nis / doubt_nis, 1.0)[..., None, None]
     return nis
@@ -155,7 +162,7 @@ def adapt(bank: Bank, inside: Array, mean_white: Array, mean_share: Array, dt_s:
         disturbance *= math.exp(rate * within(4.0 * (like - 0.1), -1.0, 2.0))
         common = within(common, n.common_lo_mg**2, n.common_hi_mg**2)
         out.append((square, product, common, within(disturbance, n.disturbance_lo_mg, n.disturbance_hi_mg)))
-    bank.square, bank.product, bank.common_mg2, bank.disturbance_mg = np.array(out).T.copy()
+    bank.square, bank.product, bank.common_mg2, bank.disturbance_mg = map(np.array, zip(*out, strict=True))
     bank.last[:, :k] = mean_white
 
 
