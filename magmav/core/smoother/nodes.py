@@ -18,6 +18,7 @@ from magmav.core.estimators.adaptive.layout import Array
 from magmav.core.estimators.adaptive.tuning import Tuning
 from magmav.core.smoother.columns import Columns, Flags
 
+_ROUNDING_S = 1e-6  # of times added up
 _AT_ONCE = 512  # nodes: what is laid out for each is some kilobytes
 _OF_READINGS = tuple(f.name for f in fields(Readings))
 
@@ -156,7 +157,7 @@ def _groups(c: Columns, n: Tuning) -> list[list[int]]:
         if not now:
             first_s, of = t, mine
         now.append(i)
-        if len(now) == most or t - first_s + dt > block_s:
+        if len(now) == most or t - first_s + dt > block_s + _ROUNDING_S:
             out.append(now)
             now = []
     return [*out, now] if now else out
