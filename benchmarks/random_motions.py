@@ -31,11 +31,11 @@ from estimator_bench.running import tape
 from estimator_bench.scenarios import Compass, Link, Scenario
 from estimator_bench.telemetry import sent
 
+from magmav.channels import limits
 from magmav.core.channel import Channel
 from magmav.core.estimators import ESTIMATORS
 from magmav.core.types import AxisState, State
 from magmav.settings import Settings
-from magmav.vehicle import limits
 
 SIGMAS, MOST_MG = 3.0, 30.0
 

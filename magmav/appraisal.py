@@ -15,7 +15,7 @@ from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import NO_SHAPING, ZERO3, Heading, Record, Shaping, State, Vec3, vec3
+from magmav.core.types import NO_SHAPING, ZERO3, Heading, Record, Sample, Shaping, State, Vec3, vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -24,66 +24,90 @@ Result = dict[str, Any]
 Floats = NDArray[np.float64]
 
 
-def _doubles() -> array[float]:
-    return array("d")
+def _column(first: int, width: int = 1) -> property:
+    """(N,), or (N, width), of CompassLog's rows."""
+
+    def get(log: CompassLog) -> Floats:
+        rows = np.array(log.rows).reshape(-1, _WIDTH)
+        return rows[:, first] if width == 1 else rows[:, first : first + width]
+
+    return property(get)
+
+
+_WIDTH = 18
+_NOTHING = (0.0,) * 6 + (math.nan,) * 2  # neither fields nor headings
 
 
 @dataclass(slots=True)
 class CompassLog:
-    """One compass since the vehicle's last boot, a number a column: an hour of flight takes a few megabytes.
+    """One compass since the vehicle's last boot, a row of numbers a sample: an hour of flight takes a few megabytes.
 
-    sensor holds the sensor's own field with the undone motor term, offsets what was to be stored, both (3 N,), mG.
-    Headings are NaN where none was published.
+    sensor_b_mg is the sensor's own field with the undone motor term, offsets_b_mg what was to be stored. Headings are
+    NaN where none was published; published_rad is magnetic, as smoothed for the wire. throttle is NaN where nobody
+    says.
     """
 
     last: Record | None = None
     learnt: int = 0
-    boot_s: array[float] = field(default_factory=_doubles)
-    age_s: array[float] = field(default_factory=_doubles)
-    sensor_b_mg: array[float] = field(default_factory=_doubles)
-    offsets_b_mg: array[float] = field(default_factory=_doubles)
-    magnetic_rad: array[float] = field(default_factory=_doubles)
-    true_rad: array[float] = field(default_factory=_doubles)
-    stored_magnetic_rad: array[float] = field(default_factory=_doubles)
-    stored_true_rad: array[float] = field(default_factory=_doubles)
-    declination_rad: array[float] = field(default_factory=_doubles)
-    sigma_rad: array[float] = field(default_factory=_doubles)
-    noise_rad: array[float] = field(default_factory=_doubles)
-    throttle: array[float] = field(default_factory=_doubles)  # NaN where nobody says
-    published_s: array[float] = field(default_factory=_doubles)
-    published_rad: array[float] = field(default_factory=_doubles)  # magnetic, as smoothed for the wire
+    rows: array[float] = field(default_factory=lambda: array("d"))
     down_mg: float | None = None  # of a two-axis compass: the Earth's downward field that stood in for its third
 
+    boot_s = _column(0)
+    age_s = _column(1)
+    sensor_b_mg = _column(2, 3)
+    offsets_b_mg = _column(5, 3)
+    magnetic_rad = _column(8)
+    true_rad = _column(9)
+    stored_magnetic_rad = _column(10)
+    stored_true_rad = _column(11)
+    declination_rad = _column(12)
+    sigma_rad = _column(13)
+    noise_rad = _column(14)
+    throttle = _column(15)
+    published_s = _column(16)
+    published_rad = _column(17)
+
     def __len__(self) -> int:
-        return len(self.boot_s)
+        return len(self.rows) // _WIDTH
 
     def add(self, record: Record, shaping: Shaping) -> None:
         """Append one record and what the autopilot did to its value after the offsets."""
-        sensor = record.mag_b_mg
+        sensor, heading, stored = record.mag_b_mg, record.heading, record.stored_heading
         if shaping is not NO_SHAPING:
             sensor = sensor + np.linalg.solve(shaping.matrix, shaping.motor_b_mg)
-        started = record.verdict.state is not State.NO_DATA
-        magnetic, true = _angles(record.heading) if started else (math.nan, math.nan)
-        stored_magnetic, stored_true = _angles(record.stored_heading)
         self.last = record
-        if record.axes == 2 and record.heading.valid:
+        if record.axes == 2 and heading.valid:
             down = level_from_body(record.roll_rad, record.pitch_rad)[2]
             self.down_mg = float(down @ record.corrected_b_mg)
         self.learnt += record.learnt
-        self.boot_s.append(record.boot_ns / 1e9)
-        self.age_s.append(record.age_s)
-        self.sensor_b_mg.extend(sensor.tolist())
-        self.offsets_b_mg.extend(record.offsets_mg.tolist())
-        self.magnetic_rad.append(magnetic)
-        self.true_rad.append(true)
-        self.stored_magnetic_rad.append(stored_magnetic)
-        self.stored_true_rad.append(stored_true)
-        self.declination_rad.append(stored_true - stored_magnetic)
-        self.sigma_rad.append(record.heading.sigma_rad if record.heading.valid else math.nan)
-        self.noise_rad.append(noise_of_heading(record.estimate, record.estimate.horizontal_mg))
-        self.throttle.append(math.nan if record.throttle is None else record.throttle)
-        self.published_s.append(record.published_boot_ns / 1e9)
-        self.published_rad.append(_angles(record.published)[0] if started else math.nan)
+        magnetic = true = published = math.nan
+        if record.verdict.state is not State.NO_DATA:
+            magnetic, true = _angles(heading)
+            published = _angles(record.published)[0]
+        stored_magnetic, stored_true = _angles(stored)
+        self.rows.extend((
+            record.boot_ns / 1e9,
+            record.age_s,
+            *sensor.tolist(),
+            *record.offsets_mg.tolist(),
+            magnetic,
+            true,
+            stored_magnetic,
+            stored_true,
+            stored_true - stored_magnetic,
+            heading.sigma_rad if heading.valid else math.nan,
+            noise_of_heading(record.estimate, record.estimate.horizontal_mg),
+            math.nan if record.throttle is None else record.throttle,
+            record.published_boot_ns / 1e9,
+            published,
+        ))  # fmt: skip
+
+    def see(self, s: Sample, stored: Heading) -> None:
+        """Append a sample that nobody judged, with the heading of the stream as the autopilot corrects it."""
+        self.learnt += s.learn
+        magnetic, true = _angles(stored)
+        told = (s.boot_ns / 1e9, s.age_s, *_NOTHING, magnetic, true, true - magnetic)
+        self.rows.extend((*told, math.nan, math.nan, math.nan, s.boot_ns / 1e9, math.nan))
 
 
 def _angles(heading: Heading) -> tuple[float, float]:
@@ -177,14 +201,14 @@ def scores(
     """
     if reference is None or log.last is None:
         return None, None
-    declination = np.array(log.declination_rad)
+    declination = log.declination_rad
     magnetic = not np.isfinite(declination).any()
     if magnetic:
         reference = replace(reference, name=f"{reference.name}, taken as magnetic (declination not known)")
         declination = np.zeros(len(log))
     unknown = ~np.isfinite(declination)
-    measured_s = np.array(log.boot_s) - np.array(log.age_s)
-    sensor, offsets = (np.array(column).reshape(-1, 3) for column in (log.sensor_b_mg, log.offsets_b_mg))
+    measured_s = log.boot_s - log.age_s
+    sensor, offsets = log.sensor_b_mg, log.offsets_b_mg
     matrix = vehicle.calibrations.shaping(log.last.compass).matrix
     window, left_out = Window(), {"declination not known": unknown}
     if learn_for_s is not None:
@@ -197,7 +221,7 @@ def scores(
         left_out["no heading"] = np.ones(len(log), dtype=bool)  # without a dip two axes have none
     e = log.last.estimate
     calibrations = {
-        "full": Calibration(iron_at_throttle(e, matrix, np.array(log.throttle)), e.soft_iron_b @ matrix, down),
+        "full": Calibration(iron_at_throttle(e, matrix, log.throttle), e.soft_iron_b @ matrix, down),
         "offsets": Calibration(-offsets, matrix, down),
     }
     stored = vehicle.calibrations.offsets(log.last.compass)
@@ -209,7 +233,7 @@ def scores(
     if learn_for_s is None:
         live = log.magnetic_rad if magnetic else log.true_rad
         stream = log.stored_magnetic_rad if magnetic else log.stored_true_rad
-        got |= score_headings(np.array(log.boot_s), {"full": live, "stored": stream}, reference)
+        got |= score_headings(log.boot_s, {"full": live, "stored": stream}, reference)
     return _entry(got["full"], got, log), _entry(got["offsets"], got, log)
 
 
@@ -221,14 +245,14 @@ def smoothed_scores(log: CompassLog, reference: Reference | None) -> Result | No
     """
     if reference is None:
         return None
-    boot_s, measured, noise = (np.array(c) for c in (log.boot_s, log.magnetic_rad, log.noise_rad))
-    declination = np.array(log.declination_rad)
+    boot_s, measured, noise = log.boot_s, log.magnetic_rad, log.noise_rad
+    declination = log.declination_rad
     if not np.isfinite(declination).any():  # then magnetic is compared with magnetic, as in scores()
         declination = np.zeros(len(log))
     known = np.isfinite(measured)
     after = np.full(len(boot_s), math.nan)
     after[known] = [s.heading_rad for s in smooth(boot_s[known], measured[known], noise[known])]
-    late = score_headings(np.array(log.published_s), {"live": np.array(log.published_rad) + declination}, reference)
+    late = score_headings(log.published_s, {"live": log.published_rad + declination}, reference)
     got = score_headings(boot_s, {"measured": measured + declination, "rts": after + declination}, reference) | late
     return {
         name: {"rms_deg": s.rms_deg, "p95_deg": s.p95_deg, "bias_deg": s.bias_deg, "n": s.n} for name, s in got.items()
@@ -243,7 +267,7 @@ def _after(vehicle: Vehicle | Boot, learn_for_s: float) -> Window:
 
 
 def _entry(main: HeadingScore, got: dict[str, HeadingScore], log: CompassLog) -> Result:
-    sigma = np.array(log.sigma_rad)
+    sigma = log.sigma_rad
     sigma = sigma[np.isfinite(sigma)]
     return {
         "reference": main.reference,

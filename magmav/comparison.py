@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.channels import new_channel
 from magmav.core import gate
 from magmav.core.after_flight import after_flight
 from magmav.core.channel import Circumstances
@@ -31,7 +32,7 @@ from magmav.recording import Keeper, NothingToLearnFrom, play
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle, new_channel
+from magmav.vehicle import Boot, Vehicle
 
 Floats = NDArray[np.float64]
 Result = dict[str, Any]

@@ -18,7 +18,7 @@ from magmav.vehicle import Tap, Vehicle
 class Pipeline:
     """Every vehicle on a link. ``unix_offset_ns`` takes arrival time to UNIX time, for the field model's date.
 
-    tap : sees every Sample before it is learnt from, see vehicle.Tap.  idle : that is all.
+    tap : sees every Sample before it is learnt from, see vehicle.Tap.  idle : that is all, see Vehicle.
     """
 
     def __init__(

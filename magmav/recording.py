@@ -6,14 +6,18 @@ the reading on everything is the path that flies.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magmav.appraisal import CompassLog, describe
-from magmav.core.types import AttitudeReading, FieldModel, Reading, Record
+from magmav.core.correction import stored_heading
+from magmav.core.types import AttitudeReading, FieldModel, MagReading, Reading, Record
 from magmav.hearing import LinkRecording
 from magmav.link.tlog import TlogLink
 from magmav.logs import HEAD, LogError, Progress, Recording, kind_of
@@ -64,9 +68,29 @@ class NothingToLearnFrom(Exception):
     """A recording without the messages that are needed; the text says which and what was found instead."""
 
 
-_Past = tuple[
-    dict[tuple[int, int], CompassLog], list[AttitudeReading], list[tuple[bool, bool]], Boot | None
-]  # one boot: per compass, attitudes and their flags, and what the vehicle held
+@dataclass(slots=True)
+class _Attitudes:
+    """One vehicle's attitudes since its last boot, of one message, in the order of time.
+
+    rows : (N, 6) boot time ns, roll, pitch, yaw rad, armed, airborne.
+    """
+
+    source: str = ""
+    latest_ns: int = -1
+    rows: array[float] = field(default_factory=lambda: array("d"))
+
+    def add(self, r: AttitudeReading, armed: bool, airborne: bool) -> None:
+        """Take the next."""
+        self.source, self.latest_ns = r.source, r.boot_ns
+        self.rows.extend((r.boot_ns, r.roll_rad, r.pitch_rad, r.yaw_rad, armed, airborne))
+
+    def table(self) -> NDArray[np.float64]:
+        """(N, 6)."""
+        return np.array(self.rows).reshape(-1, 6)
+
+
+_Past = tuple[dict[tuple[int, int], CompassLog], _Attitudes, Boot | None]
+"""One boot: per compass, the attitudes, and what the vehicle held."""
 
 
 class Keeper:
@@ -76,65 +100,80 @@ class Keeper:
         self._pipeline = pipeline
         self._learn_for_s = learn_for_s
         self.compasses: dict[tuple[int, int], CompassLog] = {}
-        self.attitudes: dict[int, list[AttitudeReading]] = {}
-        self.flags: dict[int, list[tuple[bool, bool]]] = {}
+        self._attitudes: dict[int, _Attitudes] = {}
         self._reboots: dict[int, int] = {}
         self._past: dict[int, _Past] = {}
 
     def __call__(self, reading: Reading, record: Record | None) -> None:
         """Take one reading and the Record it led to."""
-        vehicle = self._pipeline.vehicles[reading.system]
+        system = reading.system
+        vehicle = self._pipeline.vehicles[system]
         vehicle.learn_for_s = self._learn_for_s
-        if vehicle.assembler.reboots != self._reboots.setdefault(reading.system, 0):
-            self._reboots[reading.system] = vehicle.assembler.reboots
-            self._put_away(reading.system, vehicle.former)
+        if vehicle.assembler.reboots != self._reboots.get(system, 0):
+            self._reboots[system] = vehicle.assembler.reboots
+            self._put_away(system, vehicle.former)
         if isinstance(reading, AttitudeReading):
             self._attitude(reading, vehicle)
-        elif record is not None:
-            self._record(record, vehicle)
+        elif isinstance(reading, MagReading) and (record is not None or vehicle.unjudged is not None):
+            self._mag(reading, record, vehicle)
 
     def _attitude(self, r: AttitudeReading, vehicle: Vehicle) -> None:
-        kept = self.attitudes.setdefault(r.system, [])
-        if kept and (r.source != kept[0].source or r.boot_ns <= kept[-1].boot_ns):
+        kept = self._attitudes.get(r.system)
+        if kept is None:
+            kept = self._attitudes[r.system] = _Attitudes()
+        elif r.boot_ns <= kept.latest_ns or r.source != kept.source:
             return
-        kept.append(r)
-        flags = (vehicle.phase.armed, vehicle.phase.aloft(r.boot_ns) and vehicle.phase.crash_ns is None)
-        self.flags.setdefault(r.system, []).append(flags if vehicle.phase.flyer else (True, True))
+        phase = vehicle.phase
+        aloft = phase.aloft(r.boot_ns)
+        if phase.flyer:
+            kept.add(r, phase.armed, aloft and phase.crash_ns is None)
+        else:
+            kept.add(r, True, True)
 
-    def _record(self, record: Record, vehicle: Vehicle) -> None:
-        log = self.compasses.setdefault((record.system, record.compass), CompassLog())
-        log.add(record, vehicle.calibrations.shaping(record.compass))
+    def _mag(self, r: MagReading, record: Record | None, vehicle: Vehicle) -> None:
+        key = r.system, r.compass
+        log = self.compasses.get(key)
+        if log is None:
+            log = self.compasses[key] = CompassLog()
+        if vehicle.unjudged is not None:
+            sample, circumstances = vehicle.unjudged
+            log.last = record or log.last
+            sent_b_mg = vehicle.calibrations.corrected(r.compass, r.field_b_mg, r.source)
+            log.see(sample, stored_heading(sample, sent_b_mg, circumstances.expected))
+        elif record is not None:
+            log.add(record, vehicle.calibrations.standing(r.compass).shaping)
 
     def _put_away(self, system: int, boot: Boot | None) -> None:
         """The vehicle rebooted: boot times begin again. A boot that taught something is kept until another one does."""
         logs = {key: self.compasses.pop(key) for key in [k for k in self.compasses if k[0] == system]}
-        past = (logs, self.attitudes.pop(system, []), self.flags.pop(system, []), boot)
+        past = (logs, self._attitudes.pop(system, _Attitudes()), boot)
         if boot is not None and any(log.learnt for log in logs.values()):
             self._past[system] = past
 
     def bring_back(self) -> dict[int, Boot]:
         """At the end: where the last boot taught nothing, the last one that did. Systems it was done for."""
         out = {}
-        for system, (logs, attitudes, flags, boot) in self._past.items():
+        for system, (logs, attitudes, boot) in self._past.items():
             if boot is None or any(log.learnt for key, log in self.compasses.items() if key[0] == system):
                 continue
             for key in [k for k in self.compasses if k[0] == system]:
                 del self.compasses[key]
             self.compasses |= logs
-            self.attitudes[system], self.flags[system], out[system] = attitudes, flags, boot
+            self._attitudes[system], out[system] = attitudes, boot
         return out
 
     def reference(self, system: int, truth: Reference | None) -> Reference | None:
         """The truth file, or else the vehicle's own attitude over time; with the vehicle's phases of flight."""
-        kept = self.attitudes.get(system, [])
+        kept = self._attitudes.get(system, _Attitudes())
+        table = kept.table()
+        boot_ns, roll, pitch, yaw = table[:, :4].T
+        flags = table[:, 4:] > 0.0
         reference = truth
-        if reference is None and kept:
-            reference = Reference.from_attitude(kept, f"{kept[0].source} yaw")
-        flags = np.array(self.flags.get(system, []), dtype=bool)
+        if reference is None and len(table):
+            reference = Reference.from_columns(boot_ns, roll, pitch, yaw, f"{kept.source} yaw")
         if reference is None or flags.all():
             return reference
-        times = [r.boot_ns / 1e9 for r in kept]
-        return reference.with_flags(times, flags[:, 0], flags[:, 1])
+        return reference.with_flags(boot_ns / 1e9, flags[:, 0], flags[:, 1])
 
 
 def replay(

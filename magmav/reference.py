@@ -83,10 +83,17 @@ class Reference:
         if len(kinds) > 1:
             raise ValueError(f"readings: want one system and one source, got {sorted(kinds)}")
         table = np.array([(r.boot_ns, r.roll_rad, r.pitch_rad, r.yaw_rad) for r in readings]).reshape(-1, 4)
-        _, first = np.unique(table[:, 0], return_index=True)
-        boot_ns, roll, pitch, yaw = table[first].T
+        boot_ns, roll, pitch, yaw = table.T
+        return cls.from_columns(boot_ns, roll, pitch, yaw, name, gap_s)
+
+    @classmethod
+    def from_columns(
+        cls, boot_ns: Floats, roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats, name: str, gap_s: float = GAP_S
+    ) -> Self:
+        """The same from columns, (N,) each."""
+        times, first = np.unique(boot_ns, return_index=True)
         yes = np.ones(len(first), dtype=bool)
-        return cls(name, boot_ns / 1e9, roll, pitch, yaw, yes, yes, gap_s)
+        return cls(name, times / 1e9, roll_rad[first], pitch_rad[first], yaw_rad[first], yes, yes, gap_s)
 
     @classmethod
     def from_csv(cls, path: str | Path, gap_s: float = GAP_S) -> Self:

@@ -10,18 +10,16 @@ from functools import partial
 
 import numpy as np
 
-from magmav.core import gate
+from magmav.channels import idle_channel, limits, new_channel
 from magmav.core.assemble import Assembler
 from magmav.core.causes import Causes
 from magmav.core.channel import Channel, Circumstances, Finding
 from magmav.core.correction import without_third
-from magmav.core.estimators import ESTIMATORS, Estimator, Idle
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
 from magmav.core.phase import Phase
 from magmav.core.published import Publisher, noise_of_heading
-from magmav.core.rotation import wrap_pi, wrap_tau
 from magmav.core.types import (
     ZERO3,
     AttitudeReading,
@@ -50,13 +48,12 @@ from magmav.core.types import (
     vec3,
 )
 from magmav.mavlink.autopilot.books import Books
-from magmav.mavlink.autopilot.stored import StoredCalibrations
+from magmav.mavlink.autopilot.stored import Standing, StoredCalibrations
+from magmav.own_yaw import steadied
 from magmav.settings import Settings
 
 _FROZEN_S = 3.0  # one value this long while the vehicle turns: the sensor is stuck
 _SAY_FROZEN_NS = 1_000_000_000
-_DOUBTED_S = 5.0  # after a sudden change the answer is still on its way: the gyro holds the own yaw
-_WRONG_RAD = math.radians(25.0)  # own yaw so far off is wrong: it is moved slowly and may have begun so
 
 
 Tap = Callable[[Sample, Circumstances, tuple[int, int]], None]
@@ -78,7 +75,10 @@ class Boot:
 
 
 class Vehicle:
-    """One vehicle: what it says of itself, and one channel per compass. idle : only ``tap`` wants its Samples."""
+    """One vehicle: what it says of itself, and one channel per compass.
+
+    idle : only ``tap`` wants its Samples. Nothing is learnt, and a Record comes only where the circumstances changed.
+    """
 
     def __init__(
         self, system: int, settings: Settings, model: FieldModel, tap: Tap | None = None, idle: bool = False
@@ -103,6 +103,10 @@ class Vehicle:
         self._handovers: dict[int, Handover] = {}
         self._latest: dict[int, Record] = {}
         self._publishers: dict[int, Publisher] = {}
+        self._wanted: dict[int, tuple[Vec3, tuple[AxisState, ...], Vec3 | None, Vec3]] = {}
+        self._around: dict[int, tuple[tuple[ExpectedField | None, Standing, bool, bool], Circumstances]] = {}
+        self.unjudged: tuple[Sample, Circumstances] | None = None  # idle: of the last magnetometer reading, where fresh
+        self._said: dict[int, tuple[Circumstances, str]] = {}
         self._first_ns: int | None = None
         self._throttle: float | None = None
         if not math.isnan(settings.place.lat_deg):
@@ -118,7 +122,8 @@ class Vehicle:
     def rebooted(self, boot_ns: int) -> None:
         """Its clock shows boot_ns since a reboot, as messages tell that give no reading."""
         self.assembler.rebooted(boot_ns)
-        self._after_reboot()
+        if self.assembler.reboots != self._reboots:
+            self._after_reboot()
 
     def step(self, r: Reading, t_ns: int, unix_ns: int) -> Record | None:
         """Hand one reading to whom it concerns."""
@@ -152,7 +157,8 @@ class Vehicle:
                 self.causes.current(r.ampere)
             case TimeReading():
                 self._unix_minus_boot_ns = r.unix_ns - r.boot_ns
-        self._after_reboot()
+        if self.assembler.reboots != self._reboots:
+            self._after_reboot()
         return None
 
     def _by_the_rules_of(self, autopilot: int) -> None:
@@ -174,25 +180,26 @@ class Vehicle:
 
     def _mag(self, r: MagReading, t_ns: int, unix_ns: int) -> Record | None:
         held, compass, axes = self.calibrations, r.compass, self.settings.compass.axes
+        self.unjudged = None
         if not held.sensor(compass, r.device_id, r.source):
             self.counts["mag: same compass in a better message"] += 1
             return None
         if axes == 2:
             r = replace(r, field_b_mg=vec3((*r.field_b_mg[:2], 0.0), "field"))
-        channel = self._channel(compass)
+        channel, stored = self._channel(compass), held.standing(compass)
         channel.held = not self.learning or self._over(r.boot_ns)
-        if held.epoch(compass) != self._epochs.get(compass) and not channel.keeps:
-            self._epochs[compass] = held.epoch(compass)
+        if stored.epoch != self._epochs.get(compass) and not channel.keeps:
+            self._epochs[compass] = stored.epoch
             self.assembler.restart(compass)
             channel.restart()
             self.causes.restart(compass)
             self._handovers.pop(compass, None)
-        if not held.undoable(compass):
+        if not stored.undoable:
             self.counts[f"compass {compass}: stored matrix cannot be undone"] += 1
             return None
         learn = self._teaches(compass, r.boot_ns) and not channel.held
         undo: Callable[[Vec3], Vec3] = partial(held.undo, compass, source=r.source)
-        shaping = held.shaping(compass)
+        shaping = stored.shaping
         if axes == 2:
             try:
                 undo, shaping = without_third(undo, shaping)
@@ -202,24 +209,27 @@ class Vehicle:
         here = self.expected(unix_ns)
         model_mg = None if here is None else (here.horizontal_mg, here.down_mg)
         sample = self.assembler.mag(r, undo, shaping, learn, axes, model_mg, self._throttle)
-        self._after_reboot()
+        if self.assembler.reboots != self._reboots:
+            self._after_reboot()
         if sample is None:
             return self._frozen(r, t_ns, channel)
         sample = self._handed_over(self._handled(sample, channel.held), channel.estimate)
-        circumstances = self._circumstances(compass, here)
+        circumstances = self._circumstances(compass, here, stored)
         if self._tap is not None:
-            self._tap(sample, circumstances, (self._reboots, held.epoch(compass)))
+            self._tap(sample, circumstances, (self._reboots, stored.epoch))
+        if self._idle and not self._news(sample, circumstances):
+            return None
         used_b_mg = held.corrected(compass, r.field_b_mg, r.source)
-        finding = self._steadied(sample, channel.step(sample, used_b_mg, circumstances))
+        finding = steadied(sample, channel.step(sample, used_b_mg, circumstances), self.assembler.motion)
         if not self._idle:
             self.causes.step(sample, finding.estimate, circumstances.expected, used_b_mg, self.phase.unflown)
-        finding = self._doubted(finding, held.refuses(compass) or self.causes.refuses(compass))
+        finding = self._doubted(finding, stored.refuses or self.causes.refuses(compass))
         published, published_ns = self._publish(sample, finding)
         record = self._latest[compass] = Record(
             t_ns=t_ns,
             system=self.system,
             compass=compass,
-            device_id=held.device_id(compass),
+            device_id=stored.device_id,
             boot_ns=r.boot_ns,
             age_s=sample.age_s,
             mag_b_mg=sample.mag_b_mg,
@@ -228,19 +238,25 @@ class Vehicle:
             roll_rad=sample.roll_rad,
             pitch_rad=sample.pitch_rad,
             estimate=finding.estimate,
-            offsets_mg=self._to_store(compass, finding),
+            offsets_mg=self._to_store(compass, finding, stored.offsets),
             sigma_mg=finding.sigma_mg,
             heading=finding.heading,
             stored_heading=finding.stored_heading,
             verdict=finding.verdict,
             learnt=sample.learn,
-            relative=not held.known(compass),
+            relative=circumstances.relative,
             axes=axes,
             published=published,
             published_boot_ns=published_ns,
             throttle=sample.throttle,
         )
         return record
+
+    def _news(self, s: Sample, c: Circumstances) -> bool:
+        """Where nothing is learnt: is there anything else to say than at the sample before?"""
+        self.unjudged, was = (s, c), self._said.get(s.compass)
+        self._said[s.compass] = c, s.tilt_from
+        return was is None or was[0] is not c or was[1] != s.tilt_from
 
     def _handled(self, s: Sample, held: bool) -> Sample:
         """What is turned by hand teaches too, and says so."""
@@ -252,33 +268,22 @@ class Vehicle:
 
     def _handed_over(self, s: Sample, e: Estimate) -> Sample:
         """Undone with the offsets it was made with, while new ones take the place of old ones."""
-        handover = self._handovers.setdefault(s.compass, Handover())
+        handover = self._handovers.get(s.compass)
+        if handover is None:
+            handover = self._handovers[s.compass] = Handover()
         return handover.step(s, e, int(self.settings.learn.settle_s * 1e9))
 
     def _publish(self, sample: Sample, finding: Finding) -> tuple[Heading, int]:
         """The heading that goes out, smoothed as the settings say, and the boot time it belongs to."""
         wanted, compass = self.settings.heading, sample.compass
+        if wanted.smooth == "off":
+            self._publishers.pop(compass, None)
+            return finding.heading, sample.boot_ns
         publisher = self._publishers.get(compass)
         if publisher is None or (publisher.smoothing, publisher.lag) != (wanted.smooth, wanted.lag):
             publisher = self._publishers[compass] = Publisher(wanted.smooth, wanted.lag)
         noise = noise_of_heading(finding.estimate, finding.estimate.horizontal_mg)
         return publisher.step(sample.boot_ns, finding.heading, noise)
-
-    def _steadied(self, s: Sample, f: Finding) -> Finding:
-        """Where no attitude comes: compass 1 moves the own yaw while it is believed, and that yaw is its heading.
-
-        Own tilt and turning never hear of the compass, so nothing learnt with them confirms itself.
-        """
-        if s.tilt_from != "OWN" or s.compass != 1 or s.axes != 3 or not f.heading.valid:
-            return f
-        motion = self.assembler.motion
-        if f.verdict.state is not State.REFUSED and f.estimate.changed_ago_s >= _DOUBTED_S:
-            motion.field(f.corrected_b_mg, s.age_s + f.estimate.delay_s, f.heading.sigma_rad)
-        yaw, was = motion.magnetic_yaw(s.boot_ns), f.heading
-        if yaw is None or abs(wrap_pi(yaw - was.magnetic_rad)) > _WRONG_RAD:
-            return f
-        true = wrap_tau(was.true_rad + yaw - was.magnetic_rad) if was.true_valid else 0.0
-        return replace(f, heading=replace(was, magnetic_rad=yaw, true_rad=true))
 
     def _doubted(self, f: Finding, reason: Reason | None) -> Finding:
         """Offsets that rest on a wrong mounting or scale are not for writing, however sure they are."""
@@ -286,13 +291,21 @@ class Vehicle:
             return f
         return replace(f, verdict=Verdict(State.REFUSED, f.verdict.axes, (reason, *f.verdict.reasons)))
 
-    def _to_store(self, compass: int, finding: Finding) -> Vec3:
-        """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4)."""
-        if AxisState.NOT_OBSERVED not in finding.verdict.axes:
-            return finding.offsets_mg
-        stored = self.calibrations.offsets(compass)
-        unknown = [axis is AxisState.NOT_OBSERVED for axis in finding.verdict.axes]
-        return vec3(np.where(unknown, ZERO3 if stored is None else stored, finding.offsets_mg), "offsets")
+    def _to_store(self, compass: int, finding: Finding, stored: Vec3 | None) -> Vec3:
+        """The offsets this compass should hold: an axis that was not observed stays exactly as it is stored (S4).
+
+        None of the three changes at every sample, so the same ones are not put together anew.
+        """
+        offsets, axes = finding.offsets_mg, finding.verdict.axes
+        if AxisState.NOT_OBSERVED not in axes:
+            return offsets
+        was = self._wanted.get(compass)
+        if was is not None and was[0] is offsets and was[1] is axes and was[2] is stored:
+            return was[3]
+        unknown = [axis is AxisState.NOT_OBSERVED for axis in axes]
+        out = vec3(np.where(unknown, ZERO3 if stored is None else stored, offsets), "offsets")
+        self._wanted[compass] = offsets, axes, stored, out
+        return out
 
     def _frozen(self, r: MagReading, t_ns: int, channel: Channel) -> Record | None:
         """A stuck sensor gives no fresh value, so nobody would judge it again: withdraw its verdict, once a second."""
@@ -303,6 +316,7 @@ class Vehicle:
             reasons = (Reason.FROZEN, *last.verdict.reasons)
             channel.verdict = Verdict(State.REFUSED, last.verdict.axes, reasons)
             self.counts["mag: frozen"] += 1
+        self._said.pop(r.compass, None)
         said = replace(last, t_ns=t_ns, boot_ns=r.boot_ns, heading=UNKNOWN, verdict=channel.verdict, learnt=False)
         said = replace(said, published=UNKNOWN, published_boot_ns=r.boot_ns)
         self._latest[r.compass] = said
@@ -320,7 +334,7 @@ class Vehicle:
 
     def _channel(self, compass: int) -> Channel:
         if compass not in self.channels:
-            self.channels[compass] = new_channel(self.settings, make=Idle if self._idle else None)
+            self.channels[compass] = (idle_channel if self._idle else new_channel)(self.settings)
         return self.channels[compass]
 
     def settle(self, compass: int) -> None:
@@ -350,22 +364,19 @@ class Vehicle:
             unix_ns = self._unix_minus_boot_ns + self._now_ns()
         return self._keeper.at(*self._place, unix_ns)
 
-    def _circumstances(self, compass: int, here: ExpectedField | None) -> Circumstances:
-        held = self.calibrations
-        return Circumstances(
-            expected=here,
-            relative=not held.known(compass),
-            assumed=held.assumed(compass),
-            parameters_changed=held.changed(compass),
-            grounded=self.phase.unflown and not self.settings.learn.on_ground,
-            frozen_s=self.assembler.frozen_s(compass),
-            stored_b_mg=held.offsets(compass) if self.phase.flyer else None,
-        )
+    def _circumstances(self, compass: int, here: ExpectedField | None, stored: Standing) -> Circumstances:
+        """Of a fresh value, so of a sensor that is not stuck; the same object while nothing changes."""
+        flyer, grounded = self.phase.flyer, self.phase.unflown and not self.settings.learn.on_ground
+        made_of = here, stored, flyer, grounded
+        was = self._around.get(compass)
+        if was is None or was[0] != made_of:
+            offsets = stored.offsets if flyer else None
+            now = Circumstances(here, not stored.known, stored.assumed, stored.changed, grounded, 0.0, offsets)
+            was = self._around[compass] = made_of, now
+        return was[1]
 
     def _after_reboot(self) -> None:
         """A vehicle that started anew may hold other parameters and stand elsewhere: begin again."""
-        if self.assembler.reboots == self._reboots:
-            return
         self._reboots = self.assembler.reboots
         self.counts["reboots"] += 1
         self.former = Boot(self.calibrations, self.phase, self.started_ns(), self.causes)
@@ -379,22 +390,8 @@ class Vehicle:
         self._handovers.clear()
         self._latest.clear()
         self._publishers.clear()
+        self._said.clear()
         self._first_ns = self._unix_minus_boot_ns = None
         for channel in self.channels.values():
             if not channel.keeps:
                 channel.restart()
-
-
-def new_channel(settings: Settings, name: str | None = None, make: Callable[[], Estimator] | None = None) -> Channel:
-    """One compass's channel.
-
-    name : of the estimator, instead of that in the settings.  make : makes it, instead of ESTIMATORS.
-    """
-    return Channel(make or ESTIMATORS[name or settings.learn.estimator], limits(settings), settings.gate.steady_s)
-
-
-def limits(settings: Settings) -> gate.Limits:
-    """The gate's lines, in its own units."""
-    g = settings.gate
-    heading_rad = math.radians(g.heading_sigma_deg)
-    return gate.Limits(g.axis_sigma_mg, heading_rad, g.residual_mg, g.field_share, g.change_s, g.samples)

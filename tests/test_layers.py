@@ -70,7 +70,7 @@ def test_the_walk_sees_the_whole_tree():
     assert len(SOURCES) > 60
     assert "magmav.core.types" in set(imports("magmav.core.estimators.kalman"))
     assert "filterpy.kalman" in set(imports("magmav.core.estimators.kalman"))
-    assert "magmav.core.gate" in set(imports("magmav.vehicle"))
+    assert "magmav.core.gate" in set(imports("magmav.channels"))
 
 
 def test_licences_that_do_not_mix_are_never_imported():

@@ -205,3 +205,23 @@ def turn_by(v):
         term = term @ k / n
         out = out + term
     return out
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_yaw_alone_is_that_of_the_whole_answer_and_the_answer_is_kept_until_the_next_reading(own):
+    m = Motion()
+    for i in range(12):
+        ns, rate = i * 50_000_000, vec3((0.1, -0.2, 0.7), "r")
+        if own:
+            m.inertial(InertialReading(1, "RAW_IMU", ns, vec3((0, 0, -9.8), "f"), rate))
+        else:
+            m.attitude(AttitudeReading(1, "ATTITUDE", ns, 0.1, 0.2, 0.0, rate))
+        for at_ns in (ns - 70_000_000, ns, ns + 20_000_000):
+            state = m.at(at_ns)
+            assert (state.yaw_rad, state.epoch) == m.yaw_at(at_ns)
+            assert m.at(at_ns) is state
+            assert not state.body_from_own.flags.writeable
+    assert state.yaw_rad > 0.2
+    before = m.at(600_000_000)
+    m.attitude(AttitudeReading(1, "ATTITUDE", 600_000_000, 0.3, 0.2, 0.0, vec3((0, 0, 0), "r")))
+    assert before.roll_rad != m.at(600_000_000).roll_rad == 0.3

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from estimator_bench.telemetry import BOOT_S, UNIX_AT_BOOT_NS, Flight
+from magmav.channels import new_channel
 from magmav.core.channel import Circumstances
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.field import ExpectedField
@@ -18,7 +19,6 @@ from magmav.core.types import Estimate, Sample, State
 from magmav.geomag import world_magnetic_model
 from magmav.pipeline import Pipeline
 from magmav.settings import Settings
-from magmav.vehicle import new_channel
 
 TICK_S = 0.2
 """The channel makes a new answer this often."""

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magmav.channels import limits, new_channel
 from magmav.core import gate
 from magmav.core.causes import Causes
 from magmav.core.channel import Channel
 from magmav.core.correction import iron_of_offsets
 from magmav.core.estimators import ESTIMATORS, Estimator
 from magmav.core.types import ZERO3, AxisState, CurrentReading, Estimate, State, ThrottleReading, Vec3
-from magmav.vehicle import limits, new_channel
 from real_bench.tapes import Heard, Tape
 
 Make = Callable[[], Estimator]

@@ -41,6 +41,9 @@ class Tick(Enum):
     DOUBT = "doubt"  # too far off to be used until a second message agrees
 
 
+_GOES_ON = Tick.GOES_ON  # asked of every reading, and an enumeration is slow to look into
+
+
 class BootClock:
     """Follows one vehicle's boot time. A jump is believed when a second, later message confirms it."""
 
@@ -52,12 +55,13 @@ class BootClock:
         """Take one boot time and say how it continues the story."""
         if self.latest_ns is None:
             self.latest_ns = boot_ns
-            return Tick.GOES_ON
+            return _GOES_ON
         ahead = boot_ns - self.latest_ns
-        if -_BACK_NS <= ahead <= _AHEAD_NS:
-            self.latest_ns = max(self.latest_ns, boot_ns)
-            self._doubt_ns = None if ahead > 0 else self._doubt_ns
-            return Tick.GOES_ON
+        if 0 < ahead <= _AHEAD_NS:
+            self.latest_ns, self._doubt_ns = boot_ns, None
+            return _GOES_ON
+        if -_BACK_NS <= ahead <= 0:
+            return _GOES_ON
         if self._doubt_ns is not None and 0 < boot_ns - self._doubt_ns <= _NEAR_NS:
             self.latest_ns, self._doubt_ns = boot_ns, None
             return Tick.REBOOT if ahead < 0 else Tick.JUMP
@@ -71,7 +75,7 @@ class _Compass:
 
     source: str
     heard_ns: int  # boot time of the last message, fresh or not
-    sent_b_mg: Vec3 | None = None
+    sent_b_mg: list[float] | None = None
     fresh_ns: int = 0
     yaw_rad: float = 0.0
     epoch: int = -1
@@ -169,29 +173,30 @@ class Assembler:
         known = self._source(reading)
         if known is None:
             return None
-        known.turned_rad += self.motion.rate_rads * max(reading.boot_ns - known.heard_ns, 0) / 1e9
-        if reading.boot_ns > known.heard_ns:
-            known.pace(reading.boot_ns, fresh=False)
-        known.heard_ns = reading.boot_ns
-        if known.sent_b_mg is not None and reading.field_b_mg.tolist() == known.sent_b_mg.tolist():
-            self.counts["mag: repeated value"] += 1
-            return None
+        boot_ns, sent_b_mg = reading.boot_ns, reading.field_b_mg.tolist()
+        known.turned_rad += self.motion.rate_rads * max(boot_ns - known.heard_ns, 0) / 1e9
+        if boot_ns > known.heard_ns:
+            known.pace(boot_ns, fresh=False)
+        known.heard_ns = boot_ns
         if known.sent_b_mg is not None:
-            known.pace(reading.boot_ns, fresh=True)
+            if sent_b_mg == known.sent_b_mg:
+                self.counts["mag: repeated value"] += 1
+                return None
+            known.pace(boot_ns, fresh=True)
         age_s = known.age_s
-        now = self.motion.at(reading.boot_ns)
-        state = self.motion.at(reading.boot_ns - round(age_s * 1e9)) if age_s else now
+        state = self.motion.at(boot_ns - round(age_s * 1e9))
+        now = self.motion.yaw_at(boot_ns)
         if state is None or now is None:
             self.counts["mag: no tilt yet"] += 1
             return None
-        dt_s = (reading.boot_ns - known.fresh_ns) / 1e9
+        dt_s, (yaw_now_rad, epoch_now) = (boot_ns - known.fresh_ns) / 1e9, now
         gap = known.restart or (dt_s > _GAP_S and not state.bridged) or known.epoch != state.epoch
         if known.sent_b_mg is not None and dt_s > _GAP_S:
             self.counts["mag: gap"] += 1
         sample = Sample(
             system=self.system,
             compass=reading.compass,
-            boot_ns=reading.boot_ns,
+            boot_ns=boot_ns,
             dt_s=0.0 if known.restart else dt_s,
             mag_b_mg=undo(reading.field_b_mg),
             shaping=shaping,
@@ -199,7 +204,7 @@ class Assembler:
             roll_rad=state.roll_rad,
             pitch_rad=state.pitch_rad,
             yaw_step_rad=0.0 if gap else state.yaw_rad - known.yaw_rad,
-            lead_rad=now.yaw_rad - state.yaw_rad if now.epoch == state.epoch else 0.0,
+            lead_rad=yaw_now_rad - state.yaw_rad if epoch_now == state.epoch else 0.0,
             age_s=age_s,
             gap=gap,
             tilt_from=state.source,
@@ -211,7 +216,7 @@ class Assembler:
             throttle=throttle,
             body_from_own=state.body_from_own,
         )
-        known.sent_b_mg, known.fresh_ns, known.turned_rad = reading.field_b_mg, reading.boot_ns, 0.0
+        known.sent_b_mg, known.fresh_ns, known.turned_rad = sent_b_mg, boot_ns, 0.0
         known.yaw_rad, known.epoch, known.restart = state.yaw_rad, state.epoch, False
         return sample
 
@@ -229,7 +234,7 @@ class Assembler:
 
     def _in_time(self, boot_ns: int) -> bool:
         tick = self.clock.hear(boot_ns)
-        if tick is Tick.GOES_ON:
+        if tick is _GOES_ON:
             return True
         self.counts[f"clock: {tick.value}"] += 1
         if tick is Tick.DOUBT:

@@ -17,6 +17,7 @@ from magmav.core.own_frame import Frame, Vector, carried, levelled, matrix, of_a
 from magmav.core.rotation import (
     cross_matrix,
     euler_rates,
+    euler_rates_of,
     level_from_body,
     tilt_from_force,
     wrap_pi,
@@ -45,14 +46,9 @@ class MotionState(NamedTuple):
     source: str
     epoch: int
     bridged: bool  # the yaw step over a long gap is still good
-    own_frame: Frame  # level with the earth, carried along by the gyro; good at every attitude
+    body_from_own: Mat3  # from a frame level with the earth, carried along by the gyro; good at every attitude
     own_tilt_rad: float = 0.0  # sigma about each level axis of a tilt that is OWN
     every_s: float = 0.0  # between the last two readings it is from
-
-    @property
-    def body_from_own(self) -> Mat3:
-        """The same as a matrix."""
-        return matrix(self.own_frame)
 
 
 class _Heard(NamedTuple):
@@ -80,6 +76,7 @@ class Motion:
         self._every_s = 0.0
         self._inertial_ns: int | None = None
         self._inertial_every_s = 0.0
+        self._asked: tuple[int, MotionState | None] | None = None  # compasses of one moment ask the same
         if own not in OWN_TILTS:
             raise ValueError(f"own: want one of {', '.join(OWN_TILTS)}, got {own!r}")
         self._own: _OwnTilt | MargAttitude = _OwnTilt()
@@ -97,7 +94,7 @@ class Motion:
         if last is not None and r.boot_ns <= last.boot_ns:
             return False
         x, y, z = r.rate_b_rads.tolist()
-        euler = euler_rates(r.roll_rad, r.pitch_rad, r.rate_b_rads)
+        euler = euler_rates_of(r.roll_rad, r.pitch_rad, x, y, z)
         dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
         self._every_s = min(dt, _LOST_S)
         if last is None:
@@ -118,12 +115,14 @@ class Motion:
                 self._recent.clear()
         self._last = _Heard(r.boot_ns, r, (x, y, z), euler, yaw, frame)
         self._recent.append(self._last)
+        self._asked = None
         self.seen_attitude = True
         return True
 
     def inertial(self, r: InertialReading) -> None:
         """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
         last = self._last
+        self._asked = None
         if self._inertial_ns is not None and r.boot_ns > self._inertial_ns:
             self._inertial_every_s = min((r.boot_ns - self._inertial_ns) / 1e9, _LOST_S)
         self._inertial_ns = r.boot_ns
@@ -139,6 +138,7 @@ class Motion:
         """
         if isinstance(self._own, MargAttitude):
             self._own.field(field_b_mg, age_s, sigma_rad)
+            self._asked = None
 
     def magnetic_yaw(self, boot_ns: int) -> float | None:
         """Own yaw from magnetic north, rad in [0, 2 pi); None where attitudes come or own yaw is not known."""
@@ -148,26 +148,58 @@ class Motion:
     def rate_rads(self) -> float:
         """Length of the newest body rate, rad/s, 0 when nothing is known."""
         last = self._last
-        return math.hypot(*(self._own.rate_b_rads.tolist() if last is None else last.rate_b_rads))
+        x, y, z = self._own.rate_b_rads.tolist() if last is None else last.rate_b_rads
+        return math.hypot(x, y, z)
 
     def at(self, boot_ns: int) -> MotionState | None:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
+        if self._asked is None or self._asked[0] != boot_ns:
+            heard = self._nearest(boot_ns)
+            self._asked = boot_ns, self._by_own(boot_ns) if heard is None else self._by(heard, boot_ns)
+        return self._asked[1]
+
+    def yaw_at(self, boot_ns: int) -> tuple[float, int] | None:
+        """Yaw and epoch of ``at``."""
+        heard = self._nearest(boot_ns)
+        if heard is not None:
+            return heard.yaw_rad + heard.euler_rads[2] * ((boot_ns - heard.boot_ns) / 1e9), self._epoch
+        own = self._own.at(boot_ns)
+        return None if own is None else (own.yaw_rad, own.epoch)
+
+    def _nearest(self, boot_ns: int) -> _Heard | None:
+        """The attitude nearest to a boot time, of equals the earlier; None where the newest is not fresh."""
         heard = self._last
-        if heard is not None and abs(boot_ns - heard.boot_ns) <= _FRESH_NS:
-            for earlier in reversed(self._recent):
-                if abs(earlier.boot_ns - boot_ns) > abs(heard.boot_ns - boot_ns):
-                    break
-                heard = earlier
-            a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
-            roll, pitch, yaw = a.roll_rad + dr * age, a.pitch_rad + dp * age, heard.yaw_rad + dy * age
-            frame = carried(heard.own_frame, heard.rate_b_rads, age)
-            return MotionState(
-                roll, pitch, yaw, a.rate_b_rads, "ATTITUDE", self._epoch, True, frame, every_s=self._every_s
-            )
+        if heard is None:
+            return None
+        away = abs(boot_ns - heard.boot_ns)
+        if away > _FRESH_NS:
+            return None
+        for earlier in reversed(self._recent):
+            further = abs(boot_ns - earlier.boot_ns)
+            if further > away:
+                break
+            heard, away = earlier, further
+        return heard
+
+    def _by(self, heard: _Heard, boot_ns: int) -> MotionState:
+        a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
+        return MotionState(
+            a.roll_rad + dr * age,
+            a.pitch_rad + dp * age,
+            heard.yaw_rad + dy * age,
+            a.rate_b_rads,
+            "ATTITUDE",
+            self._epoch,
+            True,
+            matrix(carried(heard.own_frame, heard.rate_b_rads, age)),
+            0.0,
+            self._every_s,
+        )
+
+    def _by_own(self, boot_ns: int) -> MotionState | None:
         own = self._own.at(boot_ns)
         if own is None:
             return None
-        frame = of_attitude(own.roll_rad, own.pitch_rad, own.yaw_rad)
         return MotionState(
             own.roll_rad,
             own.pitch_rad,
@@ -176,7 +208,7 @@ class Motion:
             "OWN",
             own.epoch,
             False,
-            frame,
+            matrix(of_attitude(own.roll_rad, own.pitch_rad, own.yaw_rad)),
             own.tilt_sigma_rad,
             self._inertial_every_s,
         )

@@ -7,6 +7,7 @@ every attitude, and at that size numpy takes longer to make an array than the ar
 from __future__ import annotations
 
 import math
+from struct import Struct
 
 import numpy as np
 
@@ -16,6 +17,7 @@ Frame = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
 
 _OPPOSITE = -0.999
+_NINE = Struct("=9d")
 
 
 def of_attitude(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Frame:
@@ -57,15 +59,15 @@ def levelled(frame: Frame, roll_rad: float, pitch_rad: float) -> Frame:
 
 
 def matrix(frame: Frame) -> Mat3:
-    """From the own frame to body axes, (3, 3)."""
+    """From the own frame to body axes, (3, 3), read-only."""
     w, x, y, z = frame
-    return np.array(
-        (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
+    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    rows = _NINE.pack(
+        *(1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
+        *(2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
+        *(2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
     )
+    return np.frombuffer(rows).reshape(3, 3)  # takes a third of what an array of tuples does
 
 
 def _product(p: Frame, q: Frame) -> Frame:

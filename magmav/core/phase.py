@@ -11,17 +11,17 @@ import math
 from dataclasses import dataclass
 
 from magmav.core.handling import Handling
-from magmav.core.rotation import tilt_angle
 from magmav.core.types import Landed, LandedReading, MotionReading, PositionReading, Sample, VehicleReading
 
 # MAV_TYPE of what flies: fixed wing, multirotors, helicopters, airships, flapping wing, VTOLs, parafoil, dodecarotor.
 _FLYERS = frozenset({1, 2, 3, 4, 7, 8, 13, 14, 15, 16, 19, 20, 21, 22, 23, 24, 25, 28, 29, 35, 43})
 _FIXED_WING = 1
 _ALOFT_M = 5.0
+_ON_GROUND = Landed.ON_GROUND  # asked at every attitude, and an enumeration is slow to look into
 _FAST_MPS = 8.0
 _BLIND_S = 10.0  # armed this long with neither height nor landed state known counts as flying
 _WHO_S = 3.0  # heartbeats come once a second: after this long without one nobody will say what it is
-_CRASH_TILT_RAD = math.radians(100.0)
+_CRASH_UPRIGHT = math.cos(math.radians(100.0))  # of body down along earth down
 _CRASH_S = 1.0
 _DOWN_M, _DOWN_MPS, _DOWN_S = 2.0, 1.5, 3.0  # low and slow this long is a landing, where nobody says so
 
@@ -63,7 +63,7 @@ class Phase:
         self._height_m: float | None = None
         self._speed_mps = 0.0
         self._over_since_ns: int | None = None
-        self._handling = Handling()
+        self._handling: Handling | None = None
 
     @property
     def flyer(self) -> bool:
@@ -100,12 +100,12 @@ class Phase:
 
     def aloft(self, boot_ns: int) -> bool:
         """Armed, in the air and at least 5 m up. Also remembers the first moment it was so."""
-        up = self.armed and self._landed is not Landed.ON_GROUND and self._high(boot_ns)
+        up = self.armed and self._landed is not _ON_GROUND and self._high(boot_ns)
         if not self.flyer:
             return up
-        if up and self.takeoff_ns is None:
-            self.takeoff_ns = boot_ns
         if up:
+            if self.takeoff_ns is None:
+                self.takeoff_ns = boot_ns
             self._up(boot_ns)
         elif self.armed and self._stands(boot_ns):
             self._down(boot_ns)
@@ -138,19 +138,20 @@ class Phase:
         return self._low_since_ns is not None and boot_ns - self._low_since_ns >= _DOWN_S * 1e9
 
     def _high(self, boot_ns: int) -> bool:
-        heights = [] if self._height_m is None else [self._height_m]
+        height_m = self._height_m
         if self._alt_m is not None and self._alt_armed_m is not None:
-            heights.append(self._alt_m - self._alt_armed_m)
-        if heights:
-            return max(heights) >= _ALOFT_M or (self.kind == _FIXED_WING and self._speed_mps >= 2 * _FAST_MPS)
+            climbed_m = self._alt_m - self._alt_armed_m
+            height_m = climbed_m if height_m is None else max(height_m, climbed_m)
+        if height_m is not None:
+            return height_m >= _ALOFT_M or (self.kind == _FIXED_WING and self._speed_mps >= 2 * _FAST_MPS)
         if self._landed is not None:
             return self._landed is Landed.IN_AIR
         return self._armed_ns is not None and boot_ns - self._armed_ns > _BLIND_S * 1e9
 
     def tilt(self, roll_rad: float, pitch_rad: float, boot_ns: int) -> None:
         """Watch for a crash: a vehicle that hovers or cruises upright lying on its back for a second."""
-        over = self.armed and self.flyer and self.kind != _FIXED_WING
-        if not over or tilt_angle(roll_rad, pitch_rad) < _CRASH_TILT_RAD:
+        upright = math.cos(roll_rad) * math.cos(pitch_rad) > _CRASH_UPRIGHT
+        if upright or not (self.armed and self.flyer and self.kind != _FIXED_WING):
             self._over_since_ns = None
         elif self._over_since_ns is None:
             self._over_since_ns = boot_ns
@@ -160,8 +161,10 @@ class Phase:
     def handled(self, s: Sample) -> bool:
         """Is a vehicle that flies, and has not yet, being turned by hand? To be asked for every sample."""
         if self.armed or not self.flyer or self.takeoff_ns is not None:
-            self._handling = Handling()
+            self._handling = None
             return False
+        if self._handling is None:
+            self._handling = Handling()
         return self._handling.see(s)
 
     @property

@@ -28,8 +28,13 @@ def vec3(value: object, name: str) -> Vec3:
     out = np.array(value, dtype=np.float64)
     if out.shape != (3,) or not all(map(math.isfinite, out.tolist())):  # numpy's isfinite takes thrice as long
         raise ValueError(f"{name}: want 3 finite numbers, got {value!r}")
-    out.setflags(write=False)  # cheaper than flags.writeable
-    return out
+    return shut(out)
+
+
+def shut(made: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same array, read-only: for what was just made of numbers that are finite, and is nobody else's."""
+    made.setflags(write=False)  # cheaper than flags.writeable
+    return made
 
 
 def mat3(value: object, name: str) -> Mat3:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magmav.channels import limits
 from magmav.core import gate
 from magmav.core.causes import Causes
 from magmav.core.correction import covariance_of_field, field_of
@@ -15,7 +16,6 @@ from magmav.core.heading import heading_sigma
 from magmav.core.types import AxisState, State, Vec3, Verdict
 from magmav.fitting.case import Case, misfit
 from magmav.score import magnetic_heading_rad
-from magmav.vehicle import limits
 
 
 def judged(case: Case, finder: Causes) -> tuple[Verdict, Vec3]:

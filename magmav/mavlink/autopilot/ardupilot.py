@@ -11,7 +11,7 @@ COMPASS_PRIOn_ID, and its parameters are those whose COMPASS_DEV_IDn is that dev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from magmav.core.types import (
     Shaping,
     Vec3,
     mat3,
+    shut,
     vec3,
 )
 from magmav.mavlink.autopilot.allowed import COMPASSES
@@ -40,7 +41,7 @@ from magmav.mavlink.autopilot.ardupilot_names import (
     scheme_of,
 )
 from magmav.mavlink.autopilot.plan import plan_change as plan_change
-from magmav.mavlink.autopilot.stored import Wish, invertible, only_offsets_moved
+from magmav.mavlink.autopilot.stored import Standing, Wish, invertible, only_offsets_moved, standing_of
 
 _LEAST_SCALE, _MOST_SCALE = 1.0 / 1.5, 1.5
 _BY_THROTTLE, _BY_CURRENT = 1, 2
@@ -87,7 +88,7 @@ class Calibrations:
         self._throttle: float | None = None
         self._ampere: float | None = None
         self._parts: dict[int, tuple[Vec3, Shaping]] = {}
-        self._answers: dict[tuple[str, int], bool] = {}  # asked for every sample, changed by few messages
+        self._standing: dict[int, Standing] = {}  # asked for every sample, changed by few messages
         self._offsets: dict[int, Vec3 | None] = {}
         self._slots: dict[int, tuple[Scheme, int, bool]] = {}
 
@@ -164,6 +165,12 @@ class Calibrations:
         """ArduPilot's compasses are known by their number, and all messages carry the same."""
         return True
 
+    def standing(self, compass: int) -> Standing:
+        """All that is answered of this compass, kept until something changes it."""
+        if compass not in self._standing:
+            self._standing[compass] = standing_of(self, compass)
+        return self._standing[compass]
+
     def armed(self, armed: bool) -> None:
         """Armed or not, ArduPilot corrects alike."""
 
@@ -183,14 +190,8 @@ class Calibrations:
 
     def _forget_answers(self) -> None:
         self._parts.clear()
-        self._answers.clear()
+        self._standing.clear()
         self._offsets.clear()
-
-    def _answer(self, question: str, compass: int, find: Callable[[int], bool]) -> bool:
-        known = self._answers.get((question, compass))
-        if known is None:
-            known = self._answers[question, compass] = find(compass)
-        return known
 
     def expect(self, names: Iterable[str], values: Iterable[float]) -> None:
         """These coming values are our own doing: undone exactly, nothing need be learnt again."""
@@ -199,16 +200,10 @@ class Calibrations:
 
     def known(self, compass: int) -> bool:
         """True when stored offsets and device id were heard, so that results are absolute."""
-        return self._answer("known", compass, self._is_known)
-
-    def _is_known(self, compass: int) -> bool:
         return all(name in self._held for name in self.names(compass))
 
     def assumed(self, compass: int) -> bool:
         """True when scale, matrix or motor terms (or what drives the motor term) are the autopilot's defaults."""
-        return self._answer("assumed", compass, self._is_assumed)
-
-    def _is_assumed(self, compass: int) -> bool:
         scheme, n, _ = self._slot(compass)
         names = scheme.shaping(n)
         mode = self._held.get(MOTCT)
@@ -304,16 +299,13 @@ class Calibrations:
     def undoable(self, compass: int) -> bool:
         """False where what is stored throws a direction away, as a matrix does while only some of its zeros are heard,
         or is larger than the stream could carry."""
-        return self._answer("undoable", compass, self._is_undoable)
-
-    def _is_undoable(self, compass: int) -> bool:
         return invertible(*self._parts_of(compass))
 
     def undo(self, compass: int, sent_b_mg: Vec3, source: str = "") -> Vec3:
         """The sensor's own field, mG, body axes, from the field as sent. ValueError for a singular stored matrix."""
         offset, shaping = self._parts_of(compass)
         if shaping is NO_SHAPING:
-            return vec3(sent_b_mg - offset, "field")
+            return shut(sent_b_mg - offset)
         try:
             inner = np.linalg.solve(shaping.matrix, sent_b_mg - shaping.motor_b_mg)
         except np.linalg.LinAlgError:

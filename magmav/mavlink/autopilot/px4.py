@@ -46,7 +46,7 @@ from magmav.core.types import (
 )
 from magmav.mavlink.autopilot.px4_names import AXES, COMMON, MG_PER_GAUSS, SLOTS, offsets_of, slot_names
 from magmav.mavlink.autopilot.px4_slots import IDS, is_internal, only_one, slot_of, told_by, triple
-from magmav.mavlink.autopilot.stored import Wish, invertible, only_offsets_moved
+from magmav.mavlink.autopilot.stored import Standing, Wish, invertible, only_offsets_moved, standing_of
 
 LIVE = frozenset({"SCALED_IMU raw", "SCALED_IMU2 raw", "SCALED_IMU3 raw"})  # as Decoder names them where PX4 sends them
 RAW = frozenset({"sensor_mag"}) | LIVE
@@ -86,6 +86,7 @@ class Px4Calibrations:
         self._throttle: float | None = None
         self._ampere: float | None = None
         self._parts: dict[int, _Parts] = {}
+        self._standing: dict[int, Standing] = {}  # asked for every sample, changed by few messages
 
     def param(self, r: ParamReading) -> tuple[int, ...]:
         """Take one parameter; the compasses whose correction it changed."""
@@ -94,7 +95,7 @@ class Px4Calibrations:
             return ()
         before = {c: self._correction(c) for c in self._from}
         self._held[r.name] = r.value
-        self._parts.clear()
+        self._forget()
         if r.name in IDS and was is not None:
             self._release()
         moved_in = self._bind()
@@ -111,6 +112,7 @@ class Px4Calibrations:
     def report(self, r: CalibrationReading) -> tuple[int, ...]:
         """What PX4 applies to a compass says which slot is its own; the compasses that come to another slot by it."""
         self._reports[r.compass] = r
+        self._standing.clear()
         changed = self._bind()
         for c in changed:
             self._epoch[c] = self.epoch(c) + 1
@@ -166,7 +168,7 @@ class Px4Calibrations:
             return source == was[1]
         before = {c: self._from[c] for c in self._from if c != compass}
         self._from[compass] = (device_id, source)
-        self._parts.pop(compass, None)
+        self._forget()
         self._epoch[compass] = self.epoch(compass) + (was is not None)
         if source in LIVE:
             self._bind()
@@ -174,23 +176,33 @@ class Px4Calibrations:
                 self._epoch[c] = self.epoch(c) + (self._from[c] != before[c])
         return True
 
+    def standing(self, compass: int) -> Standing:
+        """All that is answered of this compass, kept until something changes it."""
+        if compass not in self._standing:
+            self._standing[compass] = standing_of(self, compass)
+        return self._standing[compass]
+
     def armed(self, armed: bool) -> None:
         """Take the arm state: throttle is not compensated while disarmed."""
         if armed != self._armed:
             self._armed = armed
-            self._parts.clear()
+            self._forget()
 
     def throttle(self, share: float) -> None:
         """Take the throttle, 0 to 1."""
         self._throttle = share
         if self._held.get("CAL_MAG_COMP_TYP") == _BY_THROTTLE:
-            self._parts.clear()
+            self._forget()
 
     def current(self, ampere: float) -> None:
         """Take the current of the battery that CAL_MAG_COMP_TYP names."""
         self._ampere = ampere
         if self._held.get("CAL_MAG_COMP_TYP") in (_BY_CURRENT, _BY_SECOND_CURRENT):
-            self._parts.clear()
+            self._forget()
+
+    def _forget(self) -> None:
+        self._parts.clear()
+        self._standing.clear()
 
     def expect(self, names: Iterable[str], values: Iterable[float]) -> None:
         """These coming values are our own doing: undone exactly, nothing need be learnt again."""

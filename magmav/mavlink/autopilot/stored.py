@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -40,6 +41,36 @@ class Wish(NamedTuple):
     left_b_mg: Vec3
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Standing:
+    """What StoredCalibrations answer of one compass, the same object until something is heard that may change it."""
+
+    epoch: int
+    known: bool
+    assumed: bool
+    changed: bool
+    refuses: Reason | None
+    device_id: int
+    offsets: Vec3 | None
+    shaping: Shaping
+    undoable: bool
+
+
+def standing_of(held: StoredCalibrations, compass: int) -> Standing:
+    """Asked one by one."""
+    return Standing(
+        held.epoch(compass),
+        held.known(compass),
+        held.assumed(compass),
+        held.changed(compass),
+        held.refuses(compass),
+        held.device_id(compass),
+        held.offsets(compass),
+        held.shaping(compass),
+        held.undoable(compass),
+    )
+
+
 class StoredCalibrations(Protocol):
     """What one vehicle holds for its compasses, as far as it has been heard, and how to undo it.
 
@@ -62,6 +93,10 @@ class StoredCalibrations(Protocol):
 
         False: another message tells the same better, and this one is to be left alone.
         """
+        ...
+
+    def standing(self, compass: int) -> Standing:
+        """All that the questions below answer, kept: for who asks at every sample."""
         ...
 
     def armed(self, armed: bool) -> None:
