@@ -71,7 +71,7 @@ def after_flight(
     whole = smooth(stretch, tuning)
     if whole is None:
         return None
-    times = whole.nodes.boot_ns
+    times = whole.boot_ns
     known = [(int(times[i]), e) for i in _moments(whole) if (e := whole.estimate(i)) is not None]
     if not known:
         return None
@@ -89,7 +89,7 @@ def after_flight(
 
 def _moments(whole: Smoothed) -> list[int]:
     """Nodes: the first of every second, or fewer, evenly; those next to a change; and the last."""
-    times = whole.nodes.boot_ns
+    times = whole.boot_ns
     every_ns = max(_EVERY_NS, int(times[-1] - times[0]) // _MOMENTS)
     turn = (times - times[0]) // every_ns
     wanted = {0, *(np.flatnonzero(np.diff(turn)) + 1).tolist(), len(times) - 1}

@@ -15,7 +15,7 @@ flight has shaped, instead of about what was believed on the way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from magmav.core.types import Estimate, Sample
 
 _ROUNDS = 3  # about the path of the round before: the third moves nothing by a tenth of its sigma any more
 _LATE_NS = 6_000_000_000  # a change is noticed within so long
-_COARSE = 2  # times as long are the nodes of the forward pass: it only says where to begin
+_READINGS, _BLOCKS = 12000, 1500  # about, at most, of the forward pass: it only says where to begin
 _WIDE_MG = 100.0  # the iron may step so far where a change was noticed, and more where it did
 _SHARE = 1.5
 _FAR_MG = 60.0
@@ -49,52 +49,49 @@ _LEAST_NODES = 3
 _OUTLIER_MG = 60.0  # a reading further off counts so much in what is left over
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
     """A stretch solved. solved : under each of MODELS.  changes : the iron stepped right after these nodes."""
 
-    nodes: Nodes
-    solved: Sequence[Solved]
-    changes: Sequence[int]
-    left_mg: Array  # (n, m, 3)
-    noise: Noise
-    forth: Forth
-    tuning: Tuning
+    def __init__(
+        self,
+        nodes: Nodes,
+        solved: Sequence[Solved],
+        changes: Sequence[int],
+        left_mg: Array,
+        noise: Noise,
+        forth: Forth,
+        n: Tuning,
+    ) -> None:
+        """left_mg : (n, m, 3), what is left of each reading."""
+        self.nodes, self.solved, self.changes, self.noise, self.tuning = nodes, solved, changes, noise, n
+        self._forth = forth
+        self.boot_ns = nodes.boot_ns
+        self.log_weights = weights(solved, float(nodes.dt_s.sum()), n)  # of the models, the best one zero
+        best, axes, there = solved[int(np.argmax(self.log_weights))], nodes.columns.axes, nodes.there
+        undisturbed = (left_mg + best.passing[:, None, -3:])[..., :axes]
+        # RMS of what iron, field and turning leave over
+        self.residual_mg = float(np.sqrt((np.clip(undisturbed[there], -_OUTLIER_MG, _OUTLIER_MG) ** 2).mean()))
+        squares = np.where(there[..., None], left_mg[..., :axes] ** 2, 0.0).sum((1, 2)) / (axes * there.sum(1))
+        sums = np.concatenate(([0.0], np.cumsum(squares)))
+        rows = np.arange(len(nodes))
+        first = np.maximum(rows - _LASTLY, 0)
+        # of single readings before each node, per axis
+        self._nis = (sums[rows + 1] - sums[first]) / (rows + 1 - first) / (noise.white_mg2 + noise.common_mg2)
 
     def first(self, count: int) -> Smoothed | None:
         """As it would have been solved with the first nodes alone."""
         if count < _LEAST_NODES:
             return None
         nodes = self.nodes.first(count)
-        return _Search(nodes, self.forth.first(nodes), self.tuning).run()
-
-    @property
-    def log_weights(self) -> Array:
-        """Of the models, the best one zero."""
-        return weights(self.solved, float(self.nodes.dt_s.sum()), self.tuning)
+        return _Search(nodes, self._forth.first(nodes), self.tuning).run()
 
     def estimate(self, i: int) -> Estimate | None:
         """At one node, with all of the flight known."""
         x = np.array([one.path_at(i) for one in self.solved])
         p = np.array([one.covariance(i) for one in self.solved])
         bank = Bank(x, p, np.arange(len(MODELS)), self.log_weights, self.tuning)
-        boot_ns = self.nodes.boot_ns
-        since = [float(boot_ns[i] - boot_ns[c]) / 1e9 for c in self.changes if c < i]
-        return self.forth.says(bank, min(since, default=_NEVER_S), self.residual_mg, self._nis(i))
-
-    @property
-    def residual_mg(self) -> float:
-        """RMS of what iron, field and turning leave over."""
-        axes, there = self.nodes.columns.axes, self.nodes.there
-        best = self.solved[int(np.argmax(self.log_weights))]
-        whole = (self.left_mg + best.passing[:, None, -3:])[..., :axes]
-        return float(np.sqrt((np.clip(whole[there], -_OUTLIER_MG, _OUTLIER_MG) ** 2).mean()))
-
-    def _nis(self, i: int) -> float:
-        """Of single readings before this node, per axis."""
-        axes, lately = self.nodes.columns.axes, slice(max(i - _LASTLY, 0), i + 1)
-        left = self.left_mg[lately][self.nodes.there[lately]][:, :axes]
-        return float((left**2).mean()) / (self.noise.white_mg2 + self.noise.common_mg2)
+        since = [float(self.boot_ns[i] - self.boot_ns[c]) / 1e9 for c in self.changes if c < i]
+        return self._forth.says(bank, min(since, default=_NEVER_S), self.residual_mg, float(self._nis[i]))
 
 
 def smooth(samples: Sequence[Sample], tuning: Tuning | None = None) -> Smoothed | None:
@@ -103,14 +100,8 @@ def smooth(samples: Sequence[Sample], tuning: Tuning | None = None) -> Smoothed 
     nodes = Nodes.of(Columns.of(samples, n), n) if samples else None
     if nodes is None or len(nodes) < _LEAST_NODES:
         return None
-    forth = Forth(nodes.columns, n)
-    longer = replace(
-        n,
-        block_s=_COARSE * n.block_s,
-        block_readings=_COARSE * n.block_readings,
-        nodes_most=n.nodes_most // _COARSE,
-    )
-    coarse = Nodes.of(nodes.columns, longer)
+    forth = Forth(nodes.columns, replace(n, most=len(MODELS)))
+    coarse = Nodes.of(nodes.columns.thinned(_READINGS), replace(n, block_s=2.0 * n.block_s, nodes_most=_BLOCKS))
     assert coarse is not None  # what fills fine ones
     forth.go(coarse, _LATE_NS)
     return _Search(nodes, forth, n).run()

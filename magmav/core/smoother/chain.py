@@ -25,6 +25,7 @@ Field = tuple[float, float, float, float]  # mean and sigma of H and of V, mG
 PASSING: Index = np.array([at.ALPHA, *range(at.SIZE)[at.B], *range(at.SIZE)[at.E], *range(at.SIZE)[at.D]])
 STAYING: Index = np.setdiff1d(np.arange(at.SIZE), PASSING)
 _P, _S = len(PASSING), len(STAYING)
+_BACK = np.argsort(np.concatenate((PASSING, STAYING)))
 _ALPHA, _B, _E, _D = 0, slice(1, 4), slice(4, 6), slice(6, 9)  # in PASSING
 _GYRO = slice(*np.searchsorted(STAYING, (at.G.start, at.G.stop)))
 _ANY_ALPHA = 1e-6  # information of a heading that may be any, 1/rad^2
@@ -108,12 +109,12 @@ class Solved:
     def covariance(self, i: int) -> Array:
         """Of the whole state at one node, (SIZE, SIZE)."""
         held = self._chain.held(self._which, i)
-        out = np.empty((at.SIZE, at.SIZE))
-        cross = -held @ self.spread
-        out[np.ix_(PASSING, PASSING)] = self._chain.own(self._which)[i] - cross @ held.T
-        out[np.ix_(PASSING, STAYING)] = cross
-        out[np.ix_(STAYING, PASSING)] = cross.T
-        out[np.ix_(STAYING, STAYING)] = self.spread
+        both = np.empty((at.SIZE, at.SIZE))
+        both[:_P, _P:] = cross = -held @ self.spread
+        both[_P:, :_P] = cross.T
+        both[:_P, :_P] = self._chain.own(self._which)[i] - cross @ held.T
+        both[_P:, _P:] = self.spread
+        out: Array = both[_BACK[:, None], _BACK]
         return out
 
     def step_covariance(self) -> tuple[Array, Array]:
