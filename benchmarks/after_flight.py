@@ -1,4 +1,4 @@
-"""What the adaptive estimator knows of a flight afterwards, run both ways, against what it knew at the time.
+"""What is known of a flight afterwards, smoothed, against what the adaptive estimator knew at the time.
 
     after_flight.py [--seeds A:B] [--scenarios LIST]      flights whose truth is known: error of the iron along the path
     after_flight.py --recordings FILE ...                 heading RMS over the whole flight against the recording's yaw
@@ -65,7 +65,7 @@ def spans(scenario: Scenario, takeoff_s: float) -> dict[str, tuple[float, float]
 
 def flights(scenarios: Sequence[Scenario], seeds: range) -> None:
     """A line per scenario and span."""
-    print("| scenario | span | live xy | z | error/sigma | both ways xy | z | error/sigma |")
+    print("| scenario | span | live xy | z | error/sigma | smoothed xy | z | error/sigma |")
     print("|---|---|---|---|---|---|---|---|")
     for scenario in scenarios:
         at_the_time, afterwards, placed, takeoff_s = [], [], [], 0.0
@@ -112,7 +112,7 @@ def recording(path: Path) -> None:
                 np.array(log.sensor_b_mg).reshape(-1, 3),
                 {
                     name: Calibration(one.iron_b_mg(measured_ns), got.answer.soft_iron_b @ matrix, log.down_mg)
-                    for name, one in (("live", then), ("both ways", got))
+                    for name, one in (("live", then), ("smoothed", got))
                 },
                 np.where(unknown, 0.0, declination),
                 tape_.reference,
@@ -120,7 +120,7 @@ def recording(path: Path) -> None:
                 {"declination not known": unknown},
             )
             changes = [round(t / 1e9, 1) for t in got.changes_ns]
-            row = [f"{scored[name].rms_deg:.2f}" for name in ("uncalibrated", "live", "both ways")]
+            row = [f"{scored[name].rms_deg:.2f}" for name in ("uncalibrated", "live", "smoothed")]
             print(f"| {path.name} | {compass} | {' | '.join(row)} | {scored['live'].n} | {changes} |", flush=True)
 
 
@@ -132,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--recordings", nargs="+", type=Path, metavar="FILE")
     o = parser.parse_args(argv)
     if o.recordings:
-        print("| recording | compass | uncalibrated | live | both ways | samples | changes, s |")
+        print("| recording | compass | uncalibrated | live | smoothed | samples | changes, s |")
         print("|---|---|---|---|---|---|---|")
         for path in o.recordings:
             recording(path)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import magmav
-from magmav.comparison import BOTH_WAYS, METHODS, compare
+from magmav.comparison import METHODS, SMOOTHED, compare
 from magmav.geomag import world_magnetic_model
 from magmav.link import LinkError
 from magmav.logs import LogError
@@ -25,7 +25,7 @@ from magmav.recording import NothingToLearnFrom, open_recording
 from magmav.settings import Settings
 
 DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[2] / "shared" / "data"))
-ALL = [name for name in METHODS if name != BOTH_WAYS]  # that is what fit does, which has columns of its own
+ALL = [name for name in METHODS if name != SMOOTHED]  # that is what fit does, which has columns of its own
 BEGIN, END = "<!-- recordings_table: begin -->", "<!-- recordings_table: end -->"
 
 

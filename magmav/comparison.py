@@ -2,7 +2,7 @@
 
 The recording goes through the pipeline once; the Samples it leads to are kept and given to each method in turn, so all
 methods see the same values, the same tilt and the same moments that teach. Scores of one column are made on the
-same samples. Beside the adaptive estimator stands what it knows afterwards, run both ways (core.after_flight).
+same samples. Beside the adaptive estimator stands what is known afterwards (core.after_flight).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from magmav.vehicle import Boot, Vehicle
 Floats = NDArray[np.float64]
 Result = dict[str, Any]
 
-BOTH_WAYS = "adaptive_both"
-METHODS = [n for name in ESTIMATORS for n in ((name, BOTH_WAYS) if name == "adaptive" else (name,))]
+SMOOTHED = "smoothed"
+METHODS = [n for name in ESTIMATORS for n in ((name, SMOOTHED) if name == "adaptive" else (name,))]
 
 
 class Heard(NamedTuple):
@@ -154,15 +154,15 @@ class Outcome:
     path_b_mg: Floats | None = None
 
 
-def try_both_ways(heard: Sequence[Heard], half: int, clock: Callable[[], float]) -> Outcome:
-    """The adaptive estimator run both ways over a tape, and over its first half alone."""
+def try_smoothed(heard: Sequence[Heard], half: int, clock: Callable[[], float]) -> Outcome:
+    """A tape with all of it known at once, and with its first half alone."""
     samples = [h.sample for h in heard]
     first, begun = after_flight(samples[:half]), clock()
     whole = after_flight(samples)
     us, half_answer = 1e6 * (clock() - begun) / len(heard), None if first is None else first.answer
     if whole is None:
-        return Outcome(BOTH_WAYS, half_answer, None, us, None, (), "too little data")
-    return Outcome(BOTH_WAYS, half_answer, whole.answer, us, None, (), None, path_b_mg=whole.iron_of(samples))
+        return Outcome(SMOOTHED, half_answer, None, us, None, (), "too little data")
+    return Outcome(SMOOTHED, half_answer, whole.answer, us, None, (), None, path_b_mg=whole.iron_of(samples))
 
 
 def try_estimator(
@@ -258,8 +258,8 @@ def compare(
         half = first_half(columns)
         for name in names:
             progress(f"{source}: compass {compass}, {name}")
-            if name == BOTH_WAYS:
-                outcomes.append(try_both_ways(tape.heard, half, clock))
+            if name == SMOOTHED:
+                outcomes.append(try_smoothed(tape.heard, half, clock))
             else:
                 outcomes.append(try_estimator(name, tape.heard, half, *settings_of))
         entry["compasses"].append(_compass(compass, tape, columns, half, outcomes, boot, reference))

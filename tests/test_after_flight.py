@@ -12,7 +12,7 @@ from synthetic_flight import HARD_IRON_MG
 
 from magmav.afterwards import Afterwards
 from magmav.cli import main
-from magmav.comparison import BOTH_WAYS, compare
+from magmav.comparison import SMOOTHED, compare
 from magmav.core.after_flight import AfterFlight, after_flight
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.estimators.adaptive.bank import Bank
@@ -234,16 +234,16 @@ def test_compare_has_a_row_of_it_beside_the_adaptive_estimators(heard):
         Settings(),
         earth_model,
         clock=lambda: float(next(ticks)),
-        only=["adaptive", BOTH_WAYS],
+        only=["adaptive", SMOOTHED],
     )
     live_row, row = result["vehicles"][0]["compasses"][0]["estimators"]
-    assert row["name"] == BOTH_WAYS and row["state"] is None and row["reasons"] == []
+    assert row["name"] == SMOOTHED and row["state"] is None and row["reasons"] == []
     # The live one hears the second opinion as well.
     assert row["offsets_mg"] == pytest.approx(live_row["offsets_mg"], abs=1.5)
     assert row["half_offsets_mg"] == pytest.approx(live_row["half_offsets_mg"], abs=3.0)
     assert row["in_sample"]["rms_deg"] < 6.0
     text = to_text(compare_view(result), width=120)
-    assert f" {BOTH_WAYS} " in text
+    assert f" {SMOOTHED} " in text
 
 
 def test_replay_tells_it_where_it_is_asked_for(heard):

@@ -8,7 +8,7 @@ import pytest
 from memory_flight import HZ, Bench, Frames, earth_model, flight
 from synthetic_flight import HARD_IRON_MG
 
-from magmav.comparison import BOTH_WAYS, METHODS, Tape, compare
+from magmav.comparison import METHODS, SMOOTHED, Tape, compare
 from magmav.core.estimators import ESTIMATORS
 from magmav.hearing import LinkRecording
 from magmav.pipeline import Pipeline
@@ -41,7 +41,7 @@ def compared():
 
 def test_every_estimator_of_the_project_has_a_row(compared):
     assert list(rows(compared)) == METHODS
-    assert [name for name in METHODS if name != BOTH_WAYS] == list(ESTIMATORS)
+    assert [name for name in METHODS if name != SMOOTHED] == list(ESTIMATORS)
     json.dumps(compared, allow_nan=False)
 
 
@@ -66,7 +66,7 @@ def test_three_dimensional_methods_find_the_iron_of_a_figure_eight(compared, nam
 
 def test_the_cost_is_the_clocks(compared):
     """Each step takes exactly one tick of a clock that ticks when asked: a million microseconds a sample."""
-    assert {r["us_per_sample"] for name, r in rows(compared).items() if name != BOTH_WAYS} == {1e6}
+    assert {r["us_per_sample"] for name, r in rows(compared).items() if name != SMOOTHED} == {1e6}
 
 
 def test_all_scores_of_a_column_are_made_on_the_same_samples_and_none_is_lost(compared):
@@ -99,7 +99,7 @@ def test_a_vehicle_that_never_turns_gets_no_circle_and_is_told_why():
     still = flight(seconds=30.0, iron_mg=np.array((100.0, 20.0, 300.0)), motion="hover turns")
     standing = stand(still, rng)
     got = rows(compare(told(standing), Settings(), earth_model, clock=ticking()))
-    shapeless = ("kalman", "adaptive", BOTH_WAYS, "twostep")  # they know no shape and refuse none: the gate does
+    shapeless = ("kalman", "adaptive", SMOOTHED, "twostep")  # they know no shape and refuse none: the gate does
     for name, row in got.items():
         assert row["state"] != "READY", name
         if name not in shapeless:

@@ -1,7 +1,7 @@
 """The best answer after the flight, of one log: what to store, how sure, what was cut, and what it rests on.
 
-A recording goes through the pipeline once. Its Samples are then run both ways (core.after_flight), scored on what the
-fit did not see, and turned into parameters in the autopilot's own names. Nothing here prints or writes a file.
+A recording goes through the pipeline once. Its Samples are then solved all at once (core.after_flight), scored on what
+the fit did not see, and turned into parameters in the autopilot's own names. Nothing here prints or writes a file.
 """
 
 from __future__ import annotations

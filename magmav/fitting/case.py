@@ -1,4 +1,4 @@
-"""One compass of one recording: its Samples, what was left out, and the answer of both passes."""
+"""One compass of one recording: its Samples, what was left out, and the answer."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Case:
 
 
 def solve(compass: int, tape: Tape, told: Told) -> Case | None:
-    """The answer of both passes on what is fit to teach; None where nothing was learnt."""
+    """The answer on what is fit to teach; None where nothing was learnt."""
     columns, heard = Columns.of(tape.heard), [h.sample for h in tape.heard]
     by_hand = np.array([s.by_hand for s in heard], dtype=bool)
     flown = bool((columns.learn & ~by_hand).any())

@@ -16,7 +16,7 @@ _STATES = {"NO_DATA": "no data", "LEARNING": "learning", "READY": "ready", "REFU
 _FOOT = """offset: to be added, mG, body axes; - where a method says nothing of an axis.  fit: its own RMS residual, mG.
 second half: fitted on the first half of the time that taught, heading RMS on the rest, deg; p95: of its size.
 in-sample: fitted and scored on everything.  us: microseconds a sample.
-adaptive_both: adaptive after the flight, run both ways; in-sample with the iron of each moment, no gate asked."""
+smoothed: after the flight, all of it solved at once; in-sample with the iron of each moment, no gate asked."""
 
 
 def compare_view(result: Json) -> RenderableType:

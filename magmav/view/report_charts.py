@@ -204,7 +204,7 @@ def offsets(series: Json, cut: Sequence[Json], iron_mg: Sequence[Number] | None)
         *([line_key("the fit's answer", INK, "2 3", 1.6)] if iron_mg else []),
         *_cut_key(cut),
     ]
-    caption = f"{said} Run both ways, so that each moment knows what came later too. "
+    caption = f"{said} All of the flight is solved at once, so that each moment knows what came later too. "
     caption += "Without soft iron, at the power of the moment: the values to store are in the table of offsets."
     return picture("Offsets over time", said, 302, panels, keys, caption)
 

@@ -234,9 +234,9 @@ def _afterwards(compass: Json) -> list[RenderableType]:
         return []
     known = compass["after_flight"]
     if known is None:
-        return [_para("  After the flight, run both ways: nothing is known")]
+        return [_para("  After the flight, all of it at once: nothing is known")]
     offsets, sigma = _triple(known["offsets_mg"], "+.1f"), _triple(known["sigma_mg"], ".1f")
-    out = [f"  After the flight, run both ways: offsets {offsets} mG (one sigma {sigma})"]
+    out = [f"  After the flight, all of it at once: offsets {offsets} mG (one sigma {sigma})"]
     if known["changes_s"]:
         out.append(f"    the iron changed at {', '.join(_number(t, '.1f') for t in known['changes_s'])} s of boot time")
     if known["heading"] is not None:
