@@ -15,7 +15,7 @@ from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
 from magmav.core.rotation import level_from_body
 from magmav.core.smoothing import smooth
-from magmav.core.types import NO_SHAPING, ZERO3, Heading, Record, Sample, Shaping, State, Vec3, vec3
+from magmav.core.types import ZERO3, Heading, Record, Sample, Shaping, State, Vec3, vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
 from magmav.vehicle import Boot, Vehicle
@@ -35,7 +35,7 @@ def _column(first: int, width: int = 1) -> property:
 
 
 _WIDTH = 18
-_NOTHING = (0.0,) * 6 + (math.nan,) * 2  # neither fields nor headings
+_NOTHING = (0.0,) * 3 + (math.nan,) * 2  # neither offsets nor headings
 
 
 @dataclass(slots=True)
@@ -51,6 +51,7 @@ class CompassLog:
     learnt: int = 0
     rows: array[float] = field(default_factory=lambda: array("d"))
     down_mg: float | None = None  # of a two-axis compass: the Earth's downward field that stood in for its third
+    _motor: tuple[Shaping, tuple[float, float, float]] | None = None
 
     boot_s = _column(0)
     age_s = _column(1)
@@ -72,9 +73,7 @@ class CompassLog:
 
     def add(self, record: Record, shaping: Shaping) -> None:
         """Append one record and what the autopilot did to its value after the offsets."""
-        sensor, heading, stored = record.mag_b_mg, record.heading, record.stored_heading
-        if shaping is not NO_SHAPING:
-            sensor = sensor + np.linalg.solve(shaping.matrix, shaping.motor_b_mg)
+        heading, stored = record.heading, record.stored_heading
         self.last = record
         if record.axes == 2 and heading.valid:
             down = level_from_body(record.roll_rad, record.pitch_rad)[2]
@@ -88,7 +87,7 @@ class CompassLog:
         self.rows.extend((
             record.boot_ns / 1e9,
             record.age_s,
-            *sensor.tolist(),
+            *self._sensor(record.mag_b_mg, shaping),
             *record.offsets_mg.tolist(),
             magnetic,
             true,
@@ -106,8 +105,18 @@ class CompassLog:
         """Append a sample that nobody judged, with the heading of the stream as the autopilot corrects it."""
         self.learnt += s.learn
         magnetic, true = _angles(stored)
-        told = (s.boot_ns / 1e9, s.age_s, *_NOTHING, magnetic, true, true - magnetic)
-        self.rows.extend((*told, math.nan, math.nan, math.nan, s.boot_ns / 1e9, math.nan))
+        boot_s, sensor = s.boot_ns / 1e9, self._sensor(s.mag_b_mg, s.shaping)
+        throttle = math.nan if s.throttle is None else s.throttle
+        told = (boot_s, s.age_s, *sensor, *_NOTHING, magnetic, true, true - magnetic)
+        self.rows.extend((*told, math.nan, math.nan, throttle, boot_s, math.nan))
+
+    def _sensor(self, mag_b_mg: Vec3, shaping: Shaping) -> tuple[float, float, float]:
+        """With the motor term undone, worked out once for each shaping."""
+        if self._motor is None or self._motor[0] is not shaping:
+            x, y, z = np.linalg.solve(shaping.matrix, shaping.motor_b_mg).tolist()
+            self._motor = shaping, (x, y, z)
+        (x, y, z), (a, b, c) = mag_b_mg.tolist(), self._motor[1]
+        return x + a, y + b, z + c
 
 
 def _angles(heading: Heading) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import magmav
@@ -54,6 +55,26 @@ def test_esc_status_log_comes_back_to_within_10_mg_of_what_px4_had_stored():
     assert fit["old_offsets_mg"] == pytest.approx(stored, abs=0.01)
     assert fit["new_offsets_mg"] == pytest.approx(stored, abs=10.0)
     assert "STORED_WRONG" not in codes(fit["causes"])
+
+
+@pytest.mark.parametrize(
+    ("name", "on_s", "off_s", "magnet_mg"),
+    [
+        ("broad32", 48.8, 104.8, (-61.0, 11.0, -583.0)),
+        ("broad34", 55.0, 109.8, (-16.0, -4.0, -136.0)),
+        ("broad36", 46.8, 108.5, (4.0, 2.0, 57.0)),
+    ],
+)
+def test_a_magnet_taped_on_and_taken_off_is_found_and_placed(name, on_s, off_s, magnet_mg):
+    """The step of each is that of the data set's optical truth; when it came and went shows in the raw field."""
+    result = magmav.fit(_DATA / "flights" / f"{name}_imu.tlog")
+    changes_s = result["vehicles"][0]["compasses"][0]["fit"]["changes_s"]
+    assert all(min(abs(t - on_s), abs(t - off_s)) < 1.5 for t in changes_s)
+    assert all(min(abs(t - at_s) for t in changes_s) < 1.0 for at_s in (on_s, off_s))
+    (arrays,) = result.arrays.values()
+    boot_s, iron = arrays["boot_s"], arrays["hard_iron_b_mg"]
+    with_it, after = (np.median(iron[(boot_s > a) & (boot_s < b)], axis=0) for a, b in ((on_s, off_s), (off_s, 999.0)))
+    assert with_it - after == pytest.approx(magnet_mg, abs=15.0)
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from magmav.appraisal import CompassLog
 from magmav.core.channel import Circumstances
-from magmav.core.types import CurrentReading, Reading, Record, Sample, ThrottleReading, Vec3
+from magmav.core.types import CurrentReading, MagReading, Reading, Record, Sample, ThrottleReading, Vec3
 from magmav.geomag import world_magnetic_model
 from magmav.logs import Recording
 from magmav.pipeline import Pipeline
@@ -80,11 +80,13 @@ def tapes(recording: Recording, name: str, settings: Settings | None = None) -> 
     def tap(sample: Sample, circumstances: Circumstances, stretch: tuple[int, int]) -> None:
         tapped.append((sample, circumstances, stretch))
 
-    def keep(reading: Reading, record: Record | None) -> None:
+    def keep(reading: Reading, _: Record | None) -> None:
         if isinstance(reading, CurrentReading | ThrottleReading):
             events.setdefault(reading.system, []).append(reading)
-        elif tapped and record is not None:
-            events.setdefault(reading.system, []).append(Heard(*tapped.pop(), record.stored_b_mg))
+        elif tapped and isinstance(reading, MagReading):
+            held = pipeline.vehicles[reading.system].calibrations
+            used_b_mg = held.corrected(reading.compass, reading.field_b_mg, reading.source)
+            events.setdefault(reading.system, []).append(Heard(*tapped.pop(), used_b_mg))
 
     pipeline = Pipeline(settings, world_magnetic_model, recording.unix_offset_ns, tap, idle=True)
     keeper = Keeper(pipeline, None)

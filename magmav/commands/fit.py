@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from magmav.commands.common import progress_bar, settings_of, show
+from magmav.commands.common import progress_bar, settings_of, show, spare_the_collector
 
 
 def fit(o: argparse.Namespace) -> int:
@@ -17,6 +17,7 @@ def fit(o: argparse.Namespace) -> int:
     from magmav.fitting import fit as run
     from magmav.view.fit import fit_view
 
+    spare_the_collector()
     settings = settings_of(o)
     options = FitOptions(o.soft_iron, o.motor, o.scale, None if o.reference is None else str(o.reference))
     if wanted(o):

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from magmav.commands.common import Refused, progress_bar, settings_of, show, stderr_console
+from magmav.commands.common import Refused, progress_bar, settings_of, show, spare_the_collector, stderr_console
 from magmav.core.types import Reading, Record
 from magmav.geomag import world_magnetic_model
 from magmav.settings import SettingsError
@@ -33,6 +33,7 @@ def replay(o: argparse.Namespace) -> int:
         raise SettingsError("--after-flight: takes all of the flight; leave out --learn-for")
     if o.every is not None and not o.every > 0.0:
         raise SettingsError(f"--every: want seconds above 0, got {o.every:g}")
+    spare_the_collector()
     settings = settings_of(o)
     if o.plot is not None:
         check_name(o.plot)
