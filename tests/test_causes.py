@@ -24,8 +24,9 @@ from magmav.appraisal import CompassLog, describe
 from magmav.coaching import EVERY_NS, Coaching
 from magmav.core import causes, causes_fit
 from magmav.core.causes import Causes
-from magmav.core.causes_blocks import BLOCK_S, FEATURES, ONE, Blocks
-from magmav.core.causes_fit import fit, right_angles, turn_by, turn_of
+from magmav.core.causes_blocks import BLOCK_S, FEATURES, ONE, Blocks, shaped
+from magmav.core.causes_fit import fit, turn_by, turn_of
+from magmav.core.causes_linear import right_angles
 from magmav.core.field import ExpectedField
 from magmav.core.orientation import MAVLINK, rotation
 from magmav.core.types import AxisState, Estimate, Reason, Sample, State, vec3
@@ -79,7 +80,7 @@ def only(found, code):
 def fitted(flight, expected=EXPECTED):
     blocks = Blocks()
     for s in flight:
-        blocks.step(s, 0.0, (0.0, 0.0), 0, False)
+        blocks.step(s, shaped(s), 0.0, (0.0, 0.0), 0, False)
     return fit(blocks.all(), expected)
 
 
@@ -91,7 +92,7 @@ def test_sums_of_products_say_what_the_samples_say():
     flight = samples("figure eight", 1, seconds=9.0)
     blocks = Blocks()
     for s in flight:
-        blocks.step(s, 0.0, (0.0, 0.0), 0, False)
+        blocks.step(s, shaped(s), 0.0, (0.0, 0.0), 0, False)
     (block,) = blocks.all()
     z = np.array([s.mag_b_mg for s in flight])
     assert block.n == len(flight)
@@ -103,7 +104,7 @@ def test_memory_does_not_grow_and_holds_the_last_five_minutes():
     blocks = Blocks()
     s = samples("survey", 2, seconds=1.0)[1]
     for i in range(5000):
-        blocks.step(replace(s, boot_ns=int(i * 2e8), dt_s=0.2), 0.0, (0.0, 0.0), 0, False)
+        blocks.step(replace(s, boot_ns=int(i * 2e8), dt_s=0.2), shaped(s), 0.0, (0.0, 0.0), 0, False)
     held = blocks.all()
     assert len(held) <= 31
     assert held[-1].begin_s - held[0].begin_s == pytest.approx(30 * BLOCK_S, abs=BLOCK_S)

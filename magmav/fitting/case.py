@@ -71,6 +71,11 @@ class Case:
         return self.samples[-1].shaping.matrix
 
     @property
+    def shaped_b_mg(self) -> Floats:
+        """(N, 3): as the autopilot shapes it, its offsets not applied."""
+        return self.columns.sensor_b_mg @ self.matrix.T
+
+    @property
     def split_s(self) -> float:
         """Where the second half begins."""
         return float(self.columns.boot_s[min(self.half, len(self.columns.boot_s) - 1)])
