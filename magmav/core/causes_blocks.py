@@ -70,16 +70,16 @@ def shaped(s: Sample) -> Vector:
 
 def _products(raw: list[tuple[float, ...]]) -> Array:
     """Sums of products, (WIDTH, WIDTH), of samples as Blocks keeps them: time, attitude, rate, delay, power, z."""
-    t, roll, pitch, yaw, *more = np.array(raw).T
-    rate, delay, power, z = more[:3], more[3], more[4:6], more[6:]
+    t, roll, pitch, yaw, p, q, r, delay, *rest = np.ascontiguousarray(np.array(raw).T)
     cr, sr, cp, sp, c, si = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    down = np.array((-sp, cp * sr, cp * cr))
-    first = np.array((cp * c, sp * sr * c - cr * si, sp * cr * c + sr * si))
-    second = np.array((cp * si, sp * sr * si + cr * c, sp * cr * si - sr * c))
+    down = (-sp, cp * sr, cp * cr)
+    first = (cp * c, sp * sr * c - cr * si, sp * cr * c + sr * si)
+    second = (cp * si, sp * sr * si + cr * c, sp * cr * si - sr * c)
+    seen = np.array((down, first, second))
     if delay.any():  # the body turned on by w d since: a fixed direction was seen turned the other way
-        (p, q, r), axes = delay * rate, (down, first, second)
-        down, first, second = (v + (q * v[2] - r * v[1], r * v[0] - p * v[2], p * v[1] - q * v[0]) for v in axes)
-    rows = np.vstack((down, first, second, t * first, t * second, np.ones(len(t)), power, z))
+        x, y, z = seen[:, 0], seen[:, 1], seen[:, 2]
+        seen = seen + delay * np.stack((q * z - r * y, r * x - p * z, p * y - q * x), axis=1)
+    rows = np.vstack((seen.reshape(9, -1), (t * seen[1:]).reshape(6, -1), np.ones(len(t)), *rest))
     out: Array = rows @ rows.T
     return out
 
@@ -90,6 +90,9 @@ class Where(Enum):
     GROUND = "at rest before take-off"
     HANDS = "turned by hand before take-off"
     AIR = "teaching"
+
+
+_GROUND, _HANDS, _AIR = Where
 
 
 class Blocks:
@@ -106,7 +109,7 @@ class Blocks:
         self.closed = 0
         self._standing: list[Block] = []
         self._now: Block | None = None
-        self._where = Where.AIR
+        self._where = _AIR
         self._rows: list[tuple[float, ...]] = []
         self._yaw_rad = 0.0
         self._chained = False
@@ -126,9 +129,8 @@ class Blocks:
             self._close()
             self._chained, self._was, self._dt_s = False, None, 0.0
         self._dt_s += max(s.dt_s, 0.0)
-        where = Where.HANDS if s.by_hand else Where.GROUND if grounded else Where.AIR
-        flown = bool(self.teaching) and not self.by_hand
-        if not (s.learn or grounded) or (where is Where.HANDS and flown):
+        where = _HANDS if s.by_hand else _GROUND if grounded else _AIR
+        if not (s.learn or grounded) or (where is _HANDS and self.teaching and not self.by_hand):
             self._close()
             return
         if self._now is not None and self._where is not where:
@@ -151,9 +153,9 @@ class Blocks:
 
     def _begin(self, where: Where) -> None:
         """Forget what another place has said."""
-        if where is Where.HANDS:
+        if where is _HANDS:
             self._standing, self.ground, self.by_hand = [], None, True
-        elif where is Where.AIR and self.by_hand:
+        elif where is _AIR and self.by_hand:
             self.teaching.clear()
             self.by_hand, self.closed = False, 0
 
@@ -179,7 +181,7 @@ class Blocks:
         block, self._now = self._now, None
         if block is None:
             return
-        if self._where is Where.GROUND:
+        if self._where is _GROUND:
             # The last one before take-off may already be climbing; the one before it is the ground.
             self._standing = [*self._standing[-1:], block]
             self.ground = self._standing[0]
@@ -196,7 +198,7 @@ class Blocks:
     def all(self) -> list[Block]:
         """Every block, the unfinished one too when it holds enough; asking changes no sum."""
         now = self._now
-        if now is None or self._where is Where.GROUND:
+        if now is None or self._where is _GROUND:
             return [*self.teaching]
         if self._rows:
             now = replace(now, sums=now.sums + _products(self._rows))
