@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_flight import turn
 
-from magmav.core.excitation import SECTORS, Excitation
+from magmav.core.excitation import SECTORS, Excitation, sectors_of
 
 
 def look(directions, headings=()):
@@ -68,3 +68,11 @@ def test_headings_fall_into_twelve_sectors():
     assert look([], [math.radians(a) for a in (29, 31)]).sectors == 2
     assert look([], [math.radians(a) for a in range(0, 360, 10)]).sectors == SECTORS == 12
     assert look([], [math.nextafter(2 * math.pi, 0)]).sectors == 1
+
+
+@pytest.mark.parametrize("n", [0, 1, 5, 20, 300])
+def test_many_headings_at_once_see_the_sectors_that_they_see_one_by_one(n):
+    headings = np.random.default_rng(n).uniform(0.0, math.tau, n)
+    edges = np.arange(SECTORS)[: n // 4] * math.tau / SECTORS
+    for seen in (headings, edges, np.full(n, np.nextafter(math.tau, 0.0)), np.full(n, math.tau)):
+        assert sectors_of(seen) == look([], seen).sectors

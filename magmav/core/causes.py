@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magmav.core.causes_blocks import AMPERE, ONE, Block, Blocks, field_of_sample
+from magmav.core.causes_blocks import AMPERE, ONE, Block, Blocks, Vector, shaped
 from magmav.core.causes_fit import (
     DRIFT,
     GAIN,
@@ -26,9 +26,9 @@ from magmav.core.causes_fit import (
     Fit,
     fit,
     power_name,
-    right_angles,
     turn_of,
 )
+from magmav.core.causes_linear import right_angles
 from magmav.core.field import ExpectedField
 from magmav.core.orientation import MAVLINK, rotation
 from magmav.core.types import Estimate, Reason, Sample, Vec3
@@ -113,12 +113,14 @@ class Causes:
         """Take one sample. e : the estimate after it; used_b_mg : (3,) the field as the autopilot uses it."""
         if s.axes != 3:
             return
-        w = self._watched.setdefault(s.compass, _Watched())
-        w.expected = expected
-        self._strange(w, s, used_b_mg)
+        w = self._watched.get(s.compass)
+        if w is None:
+            w = self._watched[s.compass] = _Watched()
+        w.expected, z_b_mg = expected, shaped(s)
+        self._strange(w, z_b_mg, used_b_mg)
         self._changes(w, e)
         power = (self._ampere or 0.0, self._share or 0.0)
-        w.blocks.step(s, min(max(e.delay_s, -0.2), 0.2), power, w.era, grounded)
+        w.blocks.step(s, z_b_mg, min(max(e.delay_s, -0.2), 0.2), power, w.era, grounded)
         closed = w.blocks.closed
         if closed != w.fitted_at[0] and (closed in _FIT_AT or closed % 15 == 0):
             self._fit(w)
@@ -154,11 +156,13 @@ class Causes:
 
     # ------------------------------------------------------------ at once
 
-    def _strange(self, w: _Watched, s: Sample, used_b_mg: Vec3) -> None:
+    def _strange(self, w: _Watched, z_b_mg: Vector, used_b_mg: Vec3) -> None:
         """Both as the autopilot uses it and, once the iron is known, without it."""
         strength = math.hypot(*used_b_mg.tolist())
-        known = w.fitted is not None and _earthlike(math.dist(field_of_sample(s).tolist(), w.fitted.iron_b_mg.tolist()))
-        w.strange = 0 if known or _earthlike(strength) else w.strange + 1
+        fine = _earthlike(strength) or (
+            w.fitted is not None and _earthlike(math.dist(z_b_mg, w.fitted.iron_b_mg.tolist()))
+        )
+        w.strange = 0 if fine else w.strange + 1
         if w.strange >= _STRANGE_SAMPLES:
             text = f"field of {strength:.0f} mG, the Earth's is 150 to 950 mG: magnet or steel near compass"
             w.magnet = Cause("MAGNET_NEARBY", text, {"field_mg": strength})

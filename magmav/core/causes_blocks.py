@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -32,7 +32,7 @@ WIDTH = FEATURES + 3
 
 BLOCK_S = 10.0
 BLOCKS = 30
-_BATCH = 32
+_BATCH = 256  # samples that are put into the sums at once: more than a block of most compasses has
 _JUMP_MG, _JUMP_SHARE = 60.0, 1.5  # a single value this far from its neighbour is none
 _MOST_JUMPS = 3
 _NOTICED_S = 3.0  # a sudden change is noticed no later
@@ -61,18 +61,27 @@ class Block:
         return self.begin_s + 0.5 * BLOCK_S
 
 
-def field_of_sample(s: Sample) -> Array:
-    """z = A m + e, (3,) mG: the field as the autopilot shapes it, its offsets not applied."""
-    if s.shaping is NO_SHAPING:
-        return s.mag_b_mg
-    out: Array = s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+def shaped(s: Sample) -> Vector:
+    """z = A m + e, mG by body axis: the field as the autopilot shapes it, its offsets not applied."""
+    z = s.mag_b_mg if s.shaping is NO_SHAPING else s.shaping.matrix @ s.mag_b_mg + s.shaping.motor_b_mg
+    x, y, down = z.tolist()
+    return x, y, down
+
+
+def _products(raw: list[tuple[float, ...]]) -> Array:
+    """Sums of products, (WIDTH, WIDTH), of samples as Blocks keeps them: time, attitude, rate, delay, power, z."""
+    t, roll, pitch, yaw, p, q, r, delay, *rest = np.ascontiguousarray(np.array(raw).T)
+    cr, sr, cp, sp, c, si = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    down = (-sp, cp * sr, cp * cr)
+    first = (cp * c, sp * sr * c - cr * si, sp * cr * c + sr * si)
+    second = (cp * si, sp * sr * si + cr * c, sp * cr * si - sr * c)
+    seen = np.array((down, first, second))
+    if delay.any():  # the body turned on by w d since: a fixed direction was seen turned the other way
+        x, y, z = seen[:, 0], seen[:, 1], seen[:, 2]
+        seen = seen + delay * np.stack((q * z - r * y, r * x - p * z, p * y - q * x), axis=1)
+    rows = np.vstack((seen.reshape(9, -1), (t * seen[1:]).reshape(6, -1), np.ones(len(t)), *rest))
+    out: Array = rows @ rows.T
     return out
-
-
-def _turned(v: Vector, rate_rads: list[float], dt_s: float) -> Vector:
-    """v + rate dt x v."""
-    (x, y, z), (p, q, r) = v, rate_rads
-    return x + dt_s * (q * z - r * y), y + dt_s * (r * x - p * z), z + dt_s * (p * y - q * x)
 
 
 class Where(Enum):
@@ -81,6 +90,9 @@ class Where(Enum):
     GROUND = "at rest before take-off"
     HANDS = "turned by hand before take-off"
     AIR = "teaching"
+
+
+_GROUND, _HANDS, _AIR = Where
 
 
 class Blocks:
@@ -97,7 +109,7 @@ class Blocks:
         self.closed = 0
         self._standing: list[Block] = []
         self._now: Block | None = None
-        self._where = Where.AIR
+        self._where = _AIR
         self._rows: list[tuple[float, ...]] = []
         self._yaw_rad = 0.0
         self._chained = False
@@ -105,23 +117,25 @@ class Blocks:
         self._jumps = 0
         self._dt_s = 0.0
 
-    def step(self, s: Sample, delay_s: float, power: tuple[float, float], era: int, grounded: bool) -> None:
-        """Take one sample. power: ampere and throttle, 0 where unknown; era grows when the iron suddenly changed."""
+    def step(
+        self, s: Sample, z_b_mg: Vector, delay_s: float, power: tuple[float, float], era: int, grounded: bool
+    ) -> None:
+        """Take one sample and its field, see ``shaped``.
+
+        power: ampere and throttle, 0 where unknown; era grows when the iron suddenly changed.
+        """
         self._yaw_rad = math.remainder(self._yaw_rad + s.yaw_step_rad, math.tau)
         if s.gap:
             self._close()
             self._chained, self._was, self._dt_s = False, None, 0.0
         self._dt_s += max(s.dt_s, 0.0)
-        where = Where.HANDS if s.by_hand else Where.GROUND if grounded else Where.AIR
-        flown = bool(self.teaching) and not self.by_hand
-        if not (s.learn or grounded) or (where is Where.HANDS and flown):
+        where = _HANDS if s.by_hand else _GROUND if grounded else _AIR
+        if not (s.learn or grounded) or (where is _HANDS and self.teaching and not self.by_hand):
             self._close()
             return
         if self._now is not None and self._where is not where:
             self._close()
-        x, y, w = field_of_sample(s).tolist()
-        z = (x, y, w)
-        if self._jumped(z, s):
+        if self._jumped(z_b_mg, s):
             return
         boot_s = s.boot_ns / 1e9
         if self._now is not None and self._now.era != era:
@@ -132,50 +146,34 @@ class Blocks:
             self._begin(where)
             self._now, self._where = Block(boot_s, self._chained, era), where
             self._chained = True
-        self._row(self._now, s, z, delay_s, power, boot_s)
+        t, rate = boot_s - self._now.middle_s, s.rate_b_rads.tolist()
+        self._rows.append((t, s.roll_rad, s.pitch_rad, self._yaw_rad, *rate, delay_s, *power, *z_b_mg))
+        if len(self._rows) == _BATCH:
+            self._flush()
 
     def _begin(self, where: Where) -> None:
         """Forget what another place has said."""
-        if where is Where.HANDS:
+        if where is _HANDS:
             self._standing, self.ground, self.by_hand = [], None, True
-        elif where is Where.AIR and self.by_hand:
+        elif where is _AIR and self.by_hand:
             self.teaching.clear()
             self.by_hand, self.closed = False, 0
 
     def _jumped(self, z: Vector, s: Sample) -> bool:
         """A lone outlier: far from the value before, and not followed by others like it."""
         was, dt = self._was, self._dt_s
-        far = (
-            was is not None
-            and dt < 0.5
-            and math.dist(z, was) > _JUMP_MG + _JUMP_SHARE * math.hypot(*z) * (math.hypot(*s.rate_b_rads.tolist()) * dt)
-        )
+        far = was is not None and dt < 0.5 and (off := math.dist(z, was)) > _JUMP_MG
+        if far:
+            far = off > _JUMP_MG + _JUMP_SHARE * math.hypot(*z) * (math.hypot(*s.rate_b_rads.tolist()) * dt)
         if far and self._jumps < _MOST_JUMPS:
             self._jumps += 1
             return True
         self._was, self._jumps, self._dt_s = z, 0, 0.0
         return False
 
-    def _row(
-        self, block: Block, s: Sample, z: Vector, delay_s: float, power: tuple[float, float], boot_s: float
-    ) -> None:
-        cr, sr, cp, sp = math.cos(s.roll_rad), math.sin(s.roll_rad), math.cos(s.pitch_rad), math.sin(s.pitch_rad)
-        c, si = math.cos(self._yaw_rad), math.sin(self._yaw_rad)
-        down = (-sp, cp * sr, cp * cr)
-        first = (cp * c, sp * sr * c - cr * si, sp * cr * c + sr * si)
-        second = (cp * si, sp * sr * si + cr * c, sp * cr * si - sr * c)
-        if delay_s:  # the body turned on by w d since: a fixed direction was seen turned the other way
-            turn = s.rate_b_rads.tolist()
-            down, first, second = (_turned(v, turn, delay_s) for v in (down, first, second))
-        level, t = (*first, *second), boot_s - block.middle_s
-        self._rows.append((*down, *level, *[t * v for v in level], 1.0, *power, *z))
-        if len(self._rows) == _BATCH:
-            self._flush()
-
     def _flush(self) -> None:
         if self._now is not None and self._rows:
-            rows = np.array(self._rows)
-            self._now.sums += rows.T @ rows
+            self._now.sums += _products(self._rows)
         self._rows = []
 
     def _close(self) -> None:
@@ -183,7 +181,7 @@ class Blocks:
         block, self._now = self._now, None
         if block is None:
             return
-        if self._where is Where.GROUND:
+        if self._where is _GROUND:
             # The last one before take-off may already be climbing; the one before it is the ground.
             self._standing = [*self._standing[-1:], block]
             self.ground = self._standing[0]
@@ -198,8 +196,10 @@ class Blocks:
             self.teaching.pop()
 
     def all(self) -> list[Block]:
-        """Every block, the unfinished one too when it holds enough."""
-        self._flush()
+        """Every block, the unfinished one too when it holds enough; asking changes no sum."""
         now = self._now
-        more = [now] if now is not None and self._where is not Where.GROUND and now.n >= 10 else []
-        return [*self.teaching, *more]
+        if now is None or self._where is _GROUND:
+            return [*self.teaching]
+        if self._rows:
+            now = replace(now, sums=now.sums + _products(self._rows))
+        return [*self.teaching, now] if now.n >= 10 else [*self.teaching]

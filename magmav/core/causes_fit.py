@@ -10,7 +10,6 @@ The mounting is first looked for among the 24 right-angled ones, each by a linea
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.core.causes_blocks import AMPERE, DOWN, FEATURES, ONE, THROTTLE, TOP, Block
+from magmav.core.causes_linear import FIELD_MG, IRON_MG, POWER_MG, Problem, linear, right_angles
 from magmav.core.field import MODEL_SIGMA_MG, ExpectedField
 
 Array = NDArray[np.float64]
 
-_IRON_MG, _FIELD_MG = 1000.0, 300.0
 _GAIN, _SOFT, _TURN = 0.5, 0.03, math.radians(60.0)
-_POWER = {AMPERE: 10.0, THROTTLE: 200.0}  # mG per ampere, and per full throttle
 _DRIFT = math.radians(2.0)  # rad/s
 _HOP = math.radians(4.0)  # what the gyro may lose from block to block beyond a constant drift: scale, walk
 _TILT = math.radians(0.3)  # what the attitude's slow error leaves in the turn, however long the flight
@@ -54,17 +52,6 @@ _CROSS = np.array(
         [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
     ]
 )
-
-
-def right_angles() -> list[Array]:
-    """The 24 rotations that take axes to axes, the identity first."""
-    out = [
-        np.array([[signs[i] if j == order[i] else 0.0 for j in range(3)] for i in range(3)])
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-    proper = [m for m in out if np.linalg.det(m) > 0.0]
-    return sorted(proper, key=lambda m: -float(np.trace(m)))
 
 
 def turn_by(vector_rad: Array) -> Array:
@@ -119,88 +106,6 @@ class Fit:
     def sigma(self, which: int) -> float:
         """One sigma of one of the shared unknowns."""
         return math.sqrt(max(float(self.covariance[which, which]), 0.0))
-
-
-class _Problem:
-    """The blocks of one fit, stacked: sums (J, F, F), products with z (J, F, 3)."""
-
-    def __init__(self, blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | None) -> None:
-        self.late = np.array([float(step_at is not None and i >= step_at) for i in range(len(blocks))])
-        sums = np.array([b.sums for b in blocks])
-        self.x, self.y = sums[:, :FEATURES, :FEATURES], sums[:, :FEATURES, FEATURES:]
-        self.square = float(np.einsum("jrr->", sums[:, FEATURES:, FEATURES:]))
-        self.n = float(self.x[:, ONE, ONE].sum())
-        self.middle_s = np.array([b.middle_s for b in blocks])
-        self.chained = np.array([b.chained for b in blocks])
-        self.expected = expected
-        self.power_by, self.span = self._power()
-        self.blocks = len(blocks)
-        x = self.x.sum(axis=0) / self.n
-        self.down = x[ONE, DOWN]
-        self.tilts = x[DOWN, DOWN] - np.outer(self.down, self.down)
-
-    def _power(self) -> tuple[int, float]:
-        """What drives the motor term: the battery's ampere where they are known and change, else the throttle."""
-        for column, least in ((AMPERE, 0.3), (THROTTLE, 0.02)):
-            mean = self.x[:, ONE, column].sum() / self.n
-            spread = math.sqrt(max(self.x[:, column, column].sum() / self.n - mean * mean, 0.0))
-            if spread > least:
-                return column, spread
-        return 0, 0.0
-
-    def misfit(self, theta: Array) -> float:
-        """Sum of squared residuals, mG^2; theta (J, F, 3)."""
-        return self.square - float(theta.ravel() @ (2.0 * self.y - self.x @ theta).ravel())
-
-    def normal(self, by: Array, theta: Array) -> tuple[Array, Array]:
-        """Normal matrices (J, P, P) and right sides (J, P), from derivatives by (J, P, F, 3)."""
-        j, p, f, axes = by.shape
-        through = (self.x @ by.transpose(0, 2, 1, 3).reshape(j, f, p * axes)).reshape(j, f, p, axes)
-        flat, left = by.reshape(j, p, f * axes), self.y - self.x @ theta
-        matrix = flat @ through.transpose(0, 1, 3, 2).reshape(j, f * axes, p)
-        return matrix, (flat @ left.reshape(j, f * axes, 1))[:, :, 0]
-
-    def inflation(self, theta: Array, variance: float) -> float:
-        """How many samples are worth one: residuals that go one way through a block are no separate news."""
-        left = (self.y - self.x @ theta)[:, [ONE, 0, 1, 3, 4, 6, 7]]
-        power = np.maximum(np.einsum("jff->jf", self.x)[:, [ONE, 0, 1, 3, 4, 6, 7]], 1e-9)
-        each = (left**2).sum(axis=2) / power / 3.0
-        weight = power / power.sum()
-        per_block = self.n / self.blocks
-        return float(min(max((each * weight).sum() / variance, 0.1 * per_block, 1.0), per_block))
-
-
-def _linear(p: _Problem, turn: Array, variance: float) -> tuple[float, Array, Array]:
-    """The mounting held: v, b, k, step shared and the level field of every block, all linear.
-
-    Misfit in mG^2, the shared unknowns (10,), the level fields (J, 2).
-    """
-    j = p.blocks
-    by = np.zeros((j, 12, FEATURES, 3))
-    by[:, 0, 0:3] = by[:, 10, 3:6] = by[:, 11, 6:9] = turn.T
-    for axis in range(3):
-        by[:, 1 + axis, ONE, axis] = 1.0
-        by[:, 7 + axis, ONE, axis] = p.late
-        if p.power_by:
-            by[:, 4 + axis, p.power_by, axis] = 1.0
-    matrix, right = p.normal(by, np.zeros((j, FEATURES, 3)))
-    size = 10 + 2 * j
-    whole, side = np.zeros((size, size)), np.zeros(size)
-    whole[:10, :10], side[:10] = matrix[:, :10, :10].sum(axis=0), right[:, :10].sum(axis=0)
-    whole[:10, 10:] = matrix[:, :10, 10:].transpose(1, 0, 2).reshape(10, 2 * j)
-    whole[10:, :10], side[10:] = whole[:10, 10:].T, right[:, 10:].ravel()
-    level = np.zeros((j, 2, j, 2))
-    np.einsum("iaib->iab", level)[:] = matrix[:, 10:, 10:]
-    whole[10:, 10:] = level.reshape(2 * j, 2 * j)
-    v, v_sigma = (0.0, _FIELD_MG * 2.0) if p.expected is None else (p.expected.down_mg, 0.3 * p.expected.total_mg)
-    k_sigma = _POWER.get(p.power_by, 1.0)
-    sigmas = [v_sigma, *[_IRON_MG] * 3, *[k_sigma] * 3, *[_IRON_MG] * 3, *[_FIELD_MG] * (2 * j)]
-    weights = np.array(sigmas) ** -2.0
-    prior = np.zeros(size)
-    prior[0] = v
-    answer = np.linalg.solve(whole / variance + np.diag(weights), side / variance + weights * prior)
-    fields = np.array(answer[10:], dtype=np.float64).reshape(j, 2)
-    return p.square - float(answer @ (2.0 * side - whole @ answer)), np.array(answer[:10], dtype=np.float64), fields
 
 
 class _State:
@@ -283,38 +188,43 @@ class _State:
         return out
 
 
-def _prior(p: _Problem, state: _State) -> tuple[Array, Array]:
+def _prior(p: Problem, state: _State) -> tuple[Array, Array]:
     """Information (P, P) and right side (P,) of what is known beforehand, P = SHARED + J."""
     j = p.blocks
-    here = p.expected
+    earth = p.expected
     middle, sigma = np.zeros(SHARED), np.ones(SHARED)
     middle[GAIN], sigma[GAIN], sigma[SOFT], sigma[TURN] = 1.0, _GAIN, _SOFT, _TURN
-    sigma[IRON], sigma[POWER], sigma[DRIFT] = _IRON_MG, _POWER.get(p.power_by, 1e-3), _DRIFT
-    sigma[STEP] = _IRON_MG if p.late.any() else 1e-3
-    if here is None:  # without a position nothing tells gain from field
+    sigma[IRON], sigma[POWER], sigma[DRIFT] = IRON_MG, POWER_MG.get(p.power_by, 1e-3), _DRIFT
+    sigma[STEP] = IRON_MG if p.late.any() else 1e-3
+    if earth is None:  # without a position nothing tells gain from field
         sigma[GAIN] = 1e-3
-        middle[LEVEL], sigma[LEVEL], sigma[DOWNWARD] = 230.0, _FIELD_MG, 2.0 * _FIELD_MG
+        middle[LEVEL], sigma[LEVEL], sigma[DOWNWARD] = 230.0, FIELD_MG, 2.0 * FIELD_MG
     else:
-        middle[LEVEL], middle[DOWNWARD] = here.horizontal_mg, here.down_mg
+        middle[LEVEL], middle[DOWNWARD] = earth.horizontal_mg, earth.down_mg
         sigma[LEVEL] = sigma[DOWNWARD] = MODEL_SIGMA_MG
     information = np.zeros((SHARED + j, SHARED + j))
     side = np.zeros(SHARED + j)
     information[range(TOLD), range(TOLD)] = sigma[:TOLD] ** -2.0
     information[TOLD:SHARED, TOLD:SHARED] = _tilting(p, state)
     side[:SHARED] = information[:SHARED, :SHARED] @ (middle - state.shared)
-    for i in range(1, j):
-        if not p.chained[i]:
-            continue
-        dt = p.middle_s[i] - p.middle_s[i - 1]
-        row = np.zeros(SHARED + j)
-        row[DRIFT], row[SHARED + i - 1], row[SHARED + i] = dt, 1.0, -1.0
-        off = math.remainder(state.azimuth[i] - state.azimuth[i - 1] - state.shared[DRIFT] * dt, math.tau)
-        information += np.outer(row, row) / _HOP**2
-        side += row * off / _HOP**2
+    after = np.flatnonzero(p.chained[1:]) + 1
+    dt = p.middle_s[after] - p.middle_s[after - 1]
+    off = state.azimuth[after] - state.azimuth[after - 1] - state.shared[DRIFT] * dt
+    off = (off - math.tau * np.rint(off / math.tau)) / _HOP**2
+    here, before = SHARED + after, SHARED + after - 1
+    information[DRIFT, DRIFT] += dt @ dt / _HOP**2
+    side[DRIFT] += dt @ off
+    for place, sign in ((before, 1.0), (here, -1.0)):  # no place comes twice
+        information[place, place] += _HOP**-2.0
+        information[DRIFT, place] += sign * dt / _HOP**2
+        information[place, DRIFT] += sign * dt / _HOP**2
+        side[place] += sign * off
+    information[here, before] -= _HOP**-2.0
+    information[before, here] -= _HOP**-2.0
     return information, side
 
 
-def _tilting(p: _Problem, state: _State) -> Array:
+def _tilting(p: Problem, state: _State) -> Array:
     """Information (9, 9) on what tilting seems to show beyond the field's own change.
 
     Where the attitude errs by e, the field's response to tilts of variance m comes out wrong by the share e^2 / m, as
@@ -327,7 +237,7 @@ def _tilting(p: _Problem, state: _State) -> Array:
     return np.kron((axes * sigma**-2.0) @ axes.T, np.eye(3))
 
 
-def _turn_about_down(p: _Problem) -> float:
+def _turn_about_down(p: Problem) -> float:
     """Variance, rad^2, of a turn about the down axis: only tilting shows it, and tilts err."""
     shown = max(0.5 * float(np.trace(p.tilts)) - _TILT_ERR**2, 0.05 * _TILT_ERR**2)
     return _TILT_ERR**2 / (shown * p.blocks)
@@ -338,15 +248,16 @@ def fit(blocks: Sequence[Block], expected: ExpectedField | None, step_at: int | 
 
     expected : None without a position; then gain is taken as 1. step_at : from this block on there may be other iron.
     """
-    p = _Problem(blocks, expected, step_at)
+    p = Problem(blocks, expected, step_at)
     candidates = right_angles()
     variance = 36.0 * max(0.1 * p.n / p.blocks, 1.0)
-    tried = [(_linear(p, turn, variance), turn) for turn in candidates]
-    plain = tried[0][0][0]
-    (best, shared, level), turn = min(tried, key=lambda t: t[0][0])
+    held = linear(p, np.array(candidates), variance)
+    plain, which = float(held.misfit[0]), int(np.argmin(held.misfit))
+    best = float(held.misfit[which])
     floor = max(best / (3.0 * p.n), _LEAST_MG**2) * max(0.1 * p.n / p.blocks, 1.0)
     if (plain - best) / floor < _BETTER:
-        (best, shared, level), turn = tried[0]
+        which = 0
+    turn, shared, level = candidates[which], held.shared[which], held.level_mg[which]
     gain = 1.0
     if expected is not None:
         strength = float(np.median(np.hypot(level[:, 0], level[:, 1])))

@@ -7,12 +7,20 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from magmav.core.types import Vec3
 
 _BANDS = (1, 6, 10, 6, 1)  # cells per band from nose-up pole to tail pole: about equal areas
 SECTORS = 12
 CELLS = sum(_BANDS)
 _EDGES = (-0.95, -0.45, 0.45, 0.95)
+
+
+def sectors_of(heading_rad: NDArray[np.float64]) -> int:
+    """Number of 30-degree sectors that these headings, (N,) from 0 to 2 pi, have seen: Excitation's, of many."""
+    return len(np.unique(np.minimum(heading_rad / math.tau * SECTORS, SECTORS - 1).astype(np.intp)))
 
 
 class Excitation:

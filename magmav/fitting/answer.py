@@ -104,10 +104,10 @@ def answer(
     _rewrite(entry, verdict, offsets_mg, hard_iron, sigma, heading, relative)
     return {
         "boot_s": case.columns.boot_s,
-        "sensor_b_mg": np.array([s.mag_b_mg for s in case.samples]),
+        "sensor_b_mg": case.raw_b_mg,
         "before_b_mg": before_b,
         "after_b_mg": after_b,
-        "hard_iron_b_mg": case.known.iron_of(case.samples),
+        "hard_iron_b_mg": case.iron_b_mg,
         "roll_rad": case.columns.roll_rad,
         "pitch_rad": case.columns.pitch_rad,
         "taught": taught,
@@ -160,8 +160,7 @@ def _parameters(
         new = parameters.both(new, more)
     values = {**held.stored(compass), **new.new}
     autopilot, device = case.told.autopilot, held.device_id(compass)
-    raw = np.array([s.mag_b_mg for s in case.samples])
-    made = parameters.as_the_autopilot_would(autopilot, compass, device, values, raw, case.ampere, c.throttle)
+    made = parameters.as_the_autopilot_would(autopilot, compass, device, values, case.raw_b_mg, case.ampere, c.throttle)
     return new, round(float(np.abs(made - held_out.corrected(case, after))[c.learn].max()), 4)
 
 

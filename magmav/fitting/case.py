@@ -43,6 +43,7 @@ class Case:
     """One compass, N samples. columns.learn says what the fit rests on.
 
     ampere : (N,) battery current, NaN where not known.  half : index of the first sample that is held out.
+    raw_b_mg, iron_b_mg : (N, 3) mG, the sensor's own field with its motor term, and the hard iron at each sample.
     """
 
     compass: int
@@ -54,6 +55,8 @@ class Case:
     known: AfterFlight
     half: int
     ampere: Floats
+    raw_b_mg: Floats
+    iron_b_mg: Floats
 
     @property
     def estimate(self) -> Estimate:
@@ -69,6 +72,11 @@ class Case:
     def matrix(self) -> Floats:
         """What the autopilot multiplies with."""
         return self.samples[-1].shaping.matrix
+
+    @property
+    def shaped_b_mg(self) -> Floats:
+        """(N, 3): as the autopilot shapes it, its offsets not applied."""
+        return self.columns.sensor_b_mg @ self.matrix.T
 
     @property
     def split_s(self) -> float:
@@ -106,24 +114,27 @@ def solve(compass: int, tape: Tape, told: Told) -> Case | None:
     known = after_flight(samples, until_ns=samples[half - 1].boot_ns)
     if known is None:
         return None
-    off = misfit(columns, _along(columns, known, samples), known.answer)
+    iron_b_mg = known.iron_of(samples)
+    off = misfit(columns, _along(columns, known, iron_b_mg, samples[-1]), known.answer)
     later, more = cut.near_ground(columns.boot_s, np.hypot(*off.T), keep, told.boot.phase)
     if more:
         columns, cuts = replace(columns, learn=later), cut.merged(cuts, more)
         samples, half = _taught(samples, later), first_half(columns)
         known = after_flight(samples, until_ns=samples[half - 1].boot_ns) or known
+        iron_b_mg = known.iron_of(samples)
     unknown = np.full(len(columns.boot_s), np.nan)
     ampere = unknown if told.currents is None else told.currents.at(columns.boot_s)
-    return Case(compass, tape, told, columns, samples, cuts, known, half, ampere)
+    raw_b_mg = np.array([s.mag_b_mg for s in samples])
+    return Case(compass, tape, told, columns, samples, cuts, known, half, ampere, raw_b_mg, iron_b_mg)
 
 
 def _taught(samples: Sequence[Sample], keep: Flags) -> list[Sample]:
     return [s if s.learn == bool(k) else replace(s, learn=bool(k)) for s, k in zip(samples, keep, strict=True)]
 
 
-def _along(c: Columns, known: AfterFlight, samples: Sequence[Sample]) -> Floats:
-    matrix = known.answer.soft_iron_b @ samples[-1].shaping.matrix
-    return np.asarray((c.sensor_b_mg - known.iron_of(samples)) @ matrix.T)
+def _along(c: Columns, known: AfterFlight, iron_b_mg: Floats, last: Sample) -> Floats:
+    matrix = known.answer.soft_iron_b @ last.shaping.matrix
+    return np.asarray((c.sensor_b_mg - iron_b_mg) @ matrix.T)
 
 
 def misfit(c: Columns, corrected_b_mg: Floats, e: Estimate) -> Floats:

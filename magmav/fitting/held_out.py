@@ -39,7 +39,7 @@ def headings(case: Case, before: Calibration, after: Calibration, half_mg: Float
     half_mg : the offsets (3,) that the first half alone would have stored; None where it knew nothing.
     """
     e, down = case.estimate, before.down_mg
-    full = Calibration(case.known.iron_of(case.samples), e.soft_iron_b @ case.matrix, down)
+    full = Calibration(case.iron_b_mg, e.soft_iron_b @ case.matrix, down)
     ways = {"before": before, "after": after, "full": full}
     got, name = scored(case.columns, ways, case.told.reference, Window(crash_s=case.end_s))
     if name is None:

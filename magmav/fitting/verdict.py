@@ -11,7 +11,7 @@ from magmav.channels import limits
 from magmav.core import gate
 from magmav.core.causes import Causes
 from magmav.core.correction import covariance_of_field, field_of
-from magmav.core.excitation import Excitation
+from magmav.core.excitation import sectors_of
 from magmav.core.heading import heading_sigma
 from magmav.core.types import AxisState, State, Vec3, Verdict
 from magmav.fitting.case import Case, misfit
@@ -26,10 +26,7 @@ def judged(case: Case, finder: Causes) -> tuple[Verdict, Vec3]:
     horizontal, down = field_of(e, c.expected)
     corrected = (columns.sensor_b_mg - e.hard_iron_b_mg)[taught] @ (e.soft_iron_b @ case.matrix).T
     flown = replace(columns, roll_rad=columns.roll_rad[taught], pitch_rad=columns.pitch_rad[taught])
-    seen = Excitation()
-    headings = magnetic_heading_rad(corrected, flown.roll_rad, flown.pitch_rad)
-    for field, heading in zip(corrected, headings, strict=True):
-        seen.see(field, float(heading) % math.tau)
+    headings = magnetic_heading_rad(corrected, flown.roll_rad, flown.pitch_rad)[corrected.any(axis=1)]
     level = float(np.mean(misfit(flown, corrected, e)[:, 0])) + horizontal if len(corrected) else 0.0
     states = gate.axis_states(e.own_sigma_mg, sigma, settings.gate.axis_sigma_mg)
     evidence = gate.Evidence(
@@ -42,7 +39,7 @@ def judged(case: Case, finder: Causes) -> tuple[Verdict, Vec3]:
         apart=e.apart,
         left_mg=_left_mg(case, sigma),
         steady=_steady(case, sigma, states[2]),
-        sectors=seen.sectors,
+        sectors=sectors_of(headings % math.tau),
         frozen_s=c.frozen_s if last.learn else 0.0,
         has_attitude=last.tilt_from == "ATTITUDE",
         relative=c.relative,

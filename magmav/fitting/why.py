@@ -7,7 +7,6 @@ the whole flight (core.causes_fit) says what follows power, and how sure scale, 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,16 +33,16 @@ def asked(cases: Sequence[Case]) -> tuple[dict[int, tuple[Cause, ...]], Causes]:
     finder = Causes()
     for case in cases:
         moments, era = _moments(case)
-        throttle = case.columns.throttle
-        for i, (s, h) in enumerate(zip(case.samples, case.tape.heard, strict=True)):
-            if math.isfinite(case.ampere[i]):
-                finder.current(float(case.ampere[i]))
-            if math.isfinite(throttle[i]):
-                finder.throttle(float(throttle[i]))
-            here = h.circumstances
-            stored = case.told.boot.calibrations.offsets(case.compass)
-            used = s.shaping.matrix @ (s.mag_b_mg + (0.0 if stored is None else stored)) + s.shaping.motor_b_mg
-            finder.step(s, moments[era[i]], here.expected, used, here.grounded)
+        stored = case.told.boot.calibrations.offsets(case.compass)
+        used = case.shaped_b_mg if stored is None else case.shaped_b_mg + case.matrix @ stored
+        power = zip(case.ampere.tolist(), case.columns.throttle.tolist(), strict=True)
+        each = zip(case.samples, case.tape.heard, era, used, power, strict=True)
+        for s, (_, here), moment, used_b_mg, (ampere, throttle) in each:
+            if math.isfinite(ampere):
+                finder.current(ampere)
+            if math.isfinite(throttle):
+                finder.throttle(throttle)
+            finder.step(s, moments[moment], here.expected, used_b_mg, here.grounded)
     return {case.compass: finder.of(case.compass) for case in cases}, finder
 
 
@@ -55,7 +54,7 @@ def _moments(case: Case) -> tuple[list[Estimate], list[int]]:
         since = min((t - c for c in known.changes_ns if c <= t), default=None)
         out.append(replace(e, changed_ago_s=1e9 if since is None else since / 1e9))
     last = len(out) - 1
-    return out, [min(bisect_left(times, s.boot_ns), last) for s in case.samples]
+    return out, np.minimum(np.searchsorted(times, [s.boot_ns for s in case.samples]), last).tolist()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,8 +104,9 @@ def batch(case: Case) -> Batch | None:
     blocks.teaching = deque()  # all of the flight, not its last minutes
     delay_s = min(max(case.estimate.delay_s, -0.2), 0.2)
     ampere, throttle = np.nan_to_num(case.ampere), np.nan_to_num(case.columns.throttle)
-    for s, a, t in zip(case.samples, ampere.tolist(), throttle.tolist(), strict=True):
-        blocks.step(s, delay_s, (a, t), 0, False)
+    power = zip(ampere.tolist(), throttle.tolist(), strict=True)
+    for s, z_b_mg, of_it in zip(case.samples, case.shaped_b_mg.tolist(), power, strict=True):
+        blocks.step(s, z_b_mg, delay_s, of_it, 0, False)
     all_of_them = blocks.all()
     if len(all_of_them) < _LEAST_BLOCKS:
         return None
