@@ -13,11 +13,11 @@ from magmav.core.after_flight import after_flight
 from magmav.core.estimators.adaptive import AdaptiveEstimator
 from magmav.core.estimators.adaptive import layout as at
 from magmav.core.estimators.adaptive.measurement import equation, shared_by_all, smear
-from magmav.core.estimators.adaptive.robust import WildGate
+from magmav.core.estimators.adaptive.robust import Stillness, WildGate
 from magmav.core.estimators.adaptive.tuning import HARD, MODELS, SOFT_IRON, Tuning
 from magmav.core.smoother import changes, smooth
 from magmav.core.smoother.chain import PASSING, STAYING, Chain, Way, staying_prior
-from magmav.core.smoother.columns import Columns, wild
+from magmav.core.smoother.columns import Columns, still, wild
 from magmav.core.smoother.linear import linear
 from magmav.core.smoother.nodes import Nodes
 from magmav.core.smoother.noise import Noise
@@ -219,6 +219,23 @@ def test_all_wild_readings_at_once_are_those_found_one_by_one(rows, turn):
     z, gate = np.array(rows).reshape(-1, 3), WildGate()
     turns = np.full(len(z), turn)
     assert wild(z, turns).tolist() == [gate.step(row, turn) for row in z]
+
+
+speeds = st.lists(st.sampled_from((0.0, 0.001, 0.03, 0.2)), min_size=1, max_size=12)
+
+
+@given(speeds, st.floats(0.05, 0.3), st.integers(0, 2**16))
+def test_all_that_stands_still_at_once_is_what_is_found_one_by_one(rates, dt_s, seed):
+    """Stretches of some seconds at one speed each, the field with as little noise as a table shows."""
+    rng = np.random.default_rng(seed)
+    speed = np.repeat(rates, round(4.0 / dt_s) // 2)
+    z = np.cumsum(speed[:, None] * rng.normal(0.0, 30.0, (len(speed), 3)), axis=0) + rng.normal(
+        0.0, 0.5, (len(speed), 3)
+    )
+    dt, watch = np.full(len(speed), dt_s), Stillness()
+    learn = rng.random(len(speed)) < 0.97
+    one_by_one = [bool(taught) and watch.step(*row) for taught, *row in zip(learn, z, speed, dt, strict=True)]
+    assert still(z, speed, dt, learn).tolist() == one_by_one
 
 
 @pytest.mark.parametrize("seed", range(3))

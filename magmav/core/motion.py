@@ -17,7 +17,7 @@ from magmav.core.own_frame import Frame, Vector, carried, levelled, matrix, of_a
 from magmav.core.rotation import (
     cross_matrix,
     euler_rates,
-    euler_rates_of,
+    euler_rates_at,
     level_from_body,
     tilt_from_force,
     wrap_pi,
@@ -94,7 +94,8 @@ class Motion:
         if last is not None and r.boot_ns <= last.boot_ns:
             return False
         x, y, z = r.rate_b_rads.tolist()
-        euler = euler_rates_of(r.roll_rad, r.pitch_rad, x, y, z)
+        cr, sr, cp, sp = math.cos(r.roll_rad), math.sin(r.roll_rad), math.cos(r.pitch_rad), math.sin(r.pitch_rad)
+        euler = euler_rates_at(cr, sr, cp, sp, x, y, z)
         dt = math.inf if last is None else (r.boot_ns - last.boot_ns) / 1e9
         self._every_s = min(dt, _LOST_S)
         if last is None:
@@ -103,7 +104,7 @@ class Motion:
             yaw = last.yaw_rad + 0.5 * (last.euler_rads[2] + euler[2]) * dt
             p, q, w = last.rate_b_rads
             frame = carried(last.own_frame, (0.5 * (p + x), 0.5 * (q + y), 0.5 * (w + z)), dt)
-            frame = levelled(frame, r.roll_rad, r.pitch_rad)
+            frame = levelled(frame, (-sp, cp * sr, cp * cr))
         else:
             was, now = last.reading, of_attitude(r.roll_rad, r.pitch_rad, r.yaw_rad)
             yaw, frame = last.yaw_rad, now

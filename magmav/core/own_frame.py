@@ -37,23 +37,36 @@ def stepped(frame: Frame, before: Frame, after: Frame) -> Frame:
 
 def carried(frame: Frame, rate_b_rads: Vector, dt_s: float) -> Frame:
     """After the body has turned by these rates for a time."""
-    x, y, z = rate_b_rads
+    (x, y, z), (a, b, c, d) = rate_b_rads, frame
     rate = math.sqrt(x * x + y * y + z * z)
     half = 0.5 * rate * dt_s
-    by = -math.sin(half) / rate if rate > 1e-12 else -0.5 * dt_s
-    return _product((math.cos(half), by * x, by * y, by * z), frame)
+    by, w = -math.sin(half) / rate if rate > 1e-12 else -0.5 * dt_s, math.cos(half)
+    x, y, z = by * x, by * y, by * z
+    return (
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    )
 
 
-def levelled(frame: Frame, roll_rad: float, pitch_rad: float) -> Frame:
-    """Turned by the shortest way until it is level with the earth; as it is where that would be half a turn."""
-    w, x, y, z = frame
-    ax, ay, az = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)  # its down, and the earth's
-    cp = math.cos(pitch_rad)
-    bx, by, bz = -math.sin(pitch_rad), cp * math.sin(roll_rad), cp * math.cos(roll_rad)
+def levelled(frame: Frame, down_b: Vector) -> Frame:
+    """Turned by the shortest way until it is level with the earth; as it is where that would be half a turn.
+
+    down_b : where down is, seen from the body.
+    """
+    (w, x, y, z), (bx, by, bz) = frame, down_b
+    ax, ay, az = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)  # its own down
     c = ax * bx + ay * by + az * bz
     if c < _OPPOSITE:
         return frame
-    w, x, y, z = _product((1.0 + c, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), frame)
+    a, p, q, r = 1.0 + c, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    w, x, y, z = (
+        a * w - p * x - q * y - r * z,
+        a * x + p * w + q * z - r * y,
+        a * y - p * z + q * w + r * x,
+        a * z + p * y - q * x + r * w,
+    )
     n = math.sqrt(w * w + x * x + y * y + z * z)
     return w / n, x / n, y / n, z / n
 

@@ -21,6 +21,7 @@ _ON_GROUND = Landed.ON_GROUND  # asked at every attitude, and an enumeration is 
 _FAST_MPS = 8.0
 _BLIND_S = 10.0  # armed this long with neither height nor landed state known counts as flying
 _WHO_S = 3.0  # heartbeats come once a second: after this long without one nobody will say what it is
+_FAIR_RAD = math.radians(90.0)
 _CRASH_UPRIGHT = math.cos(math.radians(100.0))  # of body down along earth down
 _CRASH_S = 1.0
 _DOWN_M, _DOWN_MPS, _DOWN_S = 2.0, 1.5, 3.0  # low and slow this long is a landing, where nobody says so
@@ -150,8 +151,12 @@ class Phase:
 
     def tilt(self, roll_rad: float, pitch_rad: float, boot_ns: int) -> None:
         """Watch for a crash: a vehicle that hovers or cruises upright lying on its back for a second."""
-        upright = math.cos(roll_rad) * math.cos(pitch_rad) > _CRASH_UPRIGHT
-        if upright or not (self.armed and self.flyer and self.kind != _FIXED_WING):
+        upright = abs(roll_rad) < _FAIR_RAD and abs(pitch_rad) < _FAIR_RAD  # nearly always, and cheap to tell
+        if (
+            upright
+            or math.cos(roll_rad) * math.cos(pitch_rad) > _CRASH_UPRIGHT
+            or not (self.armed and self.flyer and self.kind != _FIXED_WING)
+        ):
             self._over_since_ns = None
         elif self._over_since_ns is None:
             self._over_since_ns = boot_ns

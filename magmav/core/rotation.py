@@ -59,16 +59,17 @@ def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float
 def euler_rates(roll_rad: float, pitch_rad: float, rate_b_rads: NDArray[np.float64]) -> tuple[float, float, float]:
     """Rates of roll, pitch and yaw from body rates, rad/s. Near +-90 degrees of pitch the cosine is held at 0.05."""
     p, q, r = rate_b_rads.tolist()  # plain numbers: numpy's own are slow one by one
-    return euler_rates_of(roll_rad, pitch_rad, p, q, r)
+    cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
+    return euler_rates_at(cr, sr, cp, sp, p, q, r)
 
 
-def euler_rates_of(roll_rad: float, pitch_rad: float, p: float, q: float, r: float) -> tuple[float, float, float]:
-    """The same from plain numbers."""
-    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
-    cp = math.cos(pitch_rad)
+def euler_rates_at(
+    cr: float, sr: float, cp: float, sp: float, p: float, q: float, r: float
+) -> tuple[float, float, float]:
+    """The same from cosine and sine of roll and of pitch, and body rates as plain numbers."""
     cp = math.copysign(max(abs(cp), 0.05), cp)
     turn = q * sr + r * cr
-    return p + turn * math.sin(pitch_rad) / cp, q * cr - r * sr, turn / cp
+    return p + turn * sp / cp, q * cr - r * sr, turn / cp
 
 
 def tilt_from_force(force_b: NDArray[np.float64]) -> tuple[float, float] | None:

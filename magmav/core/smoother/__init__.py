@@ -34,7 +34,7 @@ from magmav.core.types import Estimate, Sample
 
 _ROUNDS = 3  # about the path of the round before: the third moves nothing by a tenth of its sigma any more
 _LATE_NS = 6_000_000_000  # a change is noticed within so long
-_READINGS, _BLOCKS = 12000, 1500  # about, at most, of the forward pass: it only says where to begin
+_READINGS, _BLOCKS = 8000, 1000  # about, at most, of the forward pass: it only says where to begin
 _WIDE_MG = 100.0  # the iron may step so far where a change was noticed, and more where it did
 _SHARE = 1.5
 _FAR_MG = 60.0

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magmav.core.estimators.adaptive.layout import Array
-from magmav.core.estimators.adaptive.robust import WILD_MG, WILD_MG_PER_RAD, WILD_OF, Stillness
+from magmav.core.estimators.adaptive.robust import (
+    STILL_MEAN_S,
+    STILL_RADS,
+    STILL_S,
+    WILD_MG,
+    WILD_MG_PER_RAD,
+    WILD_OF,
+    Stillness,
+)
 from magmav.core.estimators.adaptive.tuning import Tuning
 from magmav.core.rotation import rotation
 from magmav.core.types import Sample, Shaping
@@ -69,12 +77,12 @@ class Columns:
         z += np.array([k.motor_b_mg for k in shapings])[shaping]
         down, speed = body[:, :, 2], np.linalg.norm(rates, axis=1)
         turned = (rates * down).sum(1) * dt_s
-        still = _still(z, speed, dt_s, learn)
-        moving = np.flatnonzero(learn & ~still)
+        rest = still(z, speed, dt_s, learn)
+        moving = np.flatnonzero(learn & ~rest)
         take = np.zeros(len(samples), dtype=bool)
         take[moving[~wild(z[moving], (speed * dt_s)[moving])]] = True
         walk = np.where(own, 4.0 * n.turn_walk_rad, n.turn_walk_rad)
-        rests = still & ~np.concatenate(([False], still[:-1]))
+        begins = rest & ~np.concatenate(([False], rest[:-1]))
         drive, driven = _drive(samples, learn)
         body, calmed, level = _calmed(body, take, n.least_tilt_rad)
         return cls(
@@ -92,9 +100,9 @@ class Columns:
             body_from_own=body,
             calmed_rad=calmed,
             rates=rates,
-            downs_s=np.where(still, 0.0, dt_s)[:, None] * down,
-            turn_rad2=np.where(still, rests * _REST_RAD**2, walk**2 * dt_s + (n.turn_scale * turned) ** 2),
-            turned_rad=np.where(still, turned, 0.0),
+            downs_s=np.where(rest, 0.0, dt_s)[:, None] * down,
+            turn_rad2=np.where(rest, begins * _REST_RAD**2, walk**2 * dt_s + (n.turn_scale * turned) ** 2),
+            turned_rad=np.where(rest, turned, 0.0),
             drive=drive,
             driven=driven,
             level=level,
@@ -127,11 +135,24 @@ def _same(a: Shaping, b: Shaping) -> bool:
     return a is b or bool((a.matrix == b.matrix).all() and (a.motor_b_mg == b.motor_b_mg).all())
 
 
-def _still(z: Array, speed_rads: Array, dt_s: Array, learn: Flags) -> Flags:
+def still(z: Array, speed_rads: Array, dt_s: Array, learn: Flags) -> Flags:
+    """As adaptive.robust.Stillness says of one after the other. It need not be asked of what is seen to move."""
     out, watch = np.zeros(len(z), dtype=bool), Stillness()
-    for i in np.flatnonzero(learn).tolist():
+    taught = np.flatnonzero(learn)
+    moves = surely_moves(speed_rads[taught], dt_s[taught])
+    if len(moves):
+        at_s = np.cumsum(dt_s[taught])
+        ends = np.concatenate((at_s[moves], at_s[-1:]))
+        if (np.diff(ends) < STILL_S).all():
+            taught = taught[: moves[0]]
+    for i in taught.tolist():
         out[i] = watch.step(z[i], speed_rads[i], dt_s[i])
     return out
+
+
+def surely_moves(speed_rads: Array, dt_s: Array) -> NDArray[np.intp]:
+    """Where one sample alone takes the mean square rate over what standing still may show: it moves for STILL_S then."""
+    return np.flatnonzero((1.0 - np.exp(-dt_s / STILL_MEAN_S)) * speed_rads**2 > STILL_RADS**2)
 
 
 def wild(z: Array, turn_rad: Array) -> Flags:

@@ -20,8 +20,8 @@ from magmav.core.rotation import rotation
 WILD_MG, WILD_MG_PER_RAD = 50.0, 330.0
 WILD_OF = 5
 _TILTS, _TILTS_LEAST = 3000, 100  # readings remembered, and wanted before anything is made of them
-_STILL_RADS, _STILL_MG = 0.02, 4.0  # slower than the bias of a bad gyro, and less change than noise leaves
-_STILL_MEAN_S, _STILL_S = 1.0, 3.0
+STILL_RADS, _STILL_MG = 0.02, 4.0  # slower than the bias of a bad gyro, and less change than noise leaves
+STILL_MEAN_S, STILL_S = 1.0, 3.0
 MEDIAN_TO_VARIANCE = 2.2  # variance of a normal value over the squared median of its size
 
 
@@ -55,11 +55,11 @@ class Stillness:
         self._anchor: tuple[float, float, float] | None = None
         self._mean = (0.0, 0.0, 0.0)
         self._rate2 = 0.0
-        self._still_s = 2.0 * _STILL_S  # until it is seen to move
+        self._still_s = 2.0 * STILL_S  # until it is seen to move
 
     def step(self, z: Array, rate_rads: float, dt_s: float) -> bool:
         """Take a reading (3,), how fast it turns, and the time since the one before."""
-        weight = 1.0 - math.exp(-dt_s / _STILL_MEAN_S)
+        weight = 1.0 - math.exp(-dt_s / STILL_MEAN_S)
         self._rate2 += weight * (rate_rads * rate_rads - self._rate2)
         x, y, w = z.tolist()
         a, b, c = self._mean
@@ -67,10 +67,10 @@ class Stillness:
             self._anchor = a, b, c = x, y, w
         self._mean = a, b, c = a + weight * (x - a), b + weight * (y - b), c + weight * (w - c)
         far = max(abs(a - self._anchor[0]), abs(b - self._anchor[1]), abs(c - self._anchor[2]))
-        if far > _STILL_MG or self._rate2 > _STILL_RADS**2 or dt_s > 1.0:
+        if far > _STILL_MG or self._rate2 > STILL_RADS**2 or dt_s > 1.0:
             self._anchor, self._still_s = self._mean, 0.0
         self._still_s += dt_s
-        return self._still_s > _STILL_S
+        return self._still_s > STILL_S
 
 
 class Tilting:

@@ -49,7 +49,7 @@ class Tuning:
     soft_most: float = 0.15  # more is no soft iron but a filter gone astray
     block_s: float = 0.4  # readings taken in together span at most this
     block_readings: int = 8  # and are at most so many
-    nodes_most: int = 3600  # of a whole flight known afterwards, about; in more than 24 minutes they are longer
+    nodes_most: int = 3000  # of a whole flight known afterwards, about; in more than 20 minutes they are longer
     white_mg: float = 5.0  # one reading's own noise at first, and its limits
     white_lo_mg: float = 2.0
     white_hi_mg: float = 15.0
