@@ -151,7 +151,7 @@ def still(z: Array, speed_rads: Array, dt_s: Array, learn: Flags) -> Flags:
 
 
 def surely_moves(speed_rads: Array, dt_s: Array) -> NDArray[np.intp]:
-    """Where one sample alone takes the mean square rate over what standing still may show: it moves for STILL_S then."""
+    """Where a sample alone takes the mean square rate over what standing still may show: then it moves for STILL_S."""
     return np.flatnonzero((1.0 - np.exp(-dt_s / STILL_MEAN_S)) * speed_rads**2 > STILL_RADS**2)
 
 
