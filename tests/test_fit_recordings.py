@@ -57,6 +57,7 @@ def test_esc_status_log_comes_back_to_within_10_mg_of_what_px4_had_stored():
     assert "STORED_WRONG" not in codes(fit["causes"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "on_s", "off_s", "magnet_mg"),
     [

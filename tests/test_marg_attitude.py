@@ -338,9 +338,8 @@ def test_while_attitudes_come_the_choice_changes_nothing(own):
                 )
             motion.field(flight.field(), 0.0, SIGMA)
             got = motion.at(flight.ms * MS)
-            out += (
-                [] if got is None or i < 3 else [(*got[:3], *got.rate_b_rads, *got[4:-1], got.body_from_own.tobytes())]
-            )
+            if got is not None and i >= 3:
+                out.append((*got[:3], *got.rate_b_rads, *got[4:7], got.own_tilt_rad, got.body_from_own.tobytes()))
         return out
 
     assert states(Motion(own)) == states(Motion())
