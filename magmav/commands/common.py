@@ -61,7 +61,7 @@ def spare_the_collector() -> None:
 
     Looking for circles anyway is a tenth of the time.
     """
-    gc.set_threshold(1_000_000, 50, 50)
+    gc.disable()
 
 
 def show(o: argparse.Namespace, result: Result, view: Callable[[Any], RenderableType]) -> None:

@@ -27,7 +27,7 @@ from magmav.core.smoother import changes
 from magmav.core.smoother.chain import Chain, Solved, Way
 from magmav.core.smoother.columns import Columns
 from magmav.core.smoother.forth import Forth
-from magmav.core.smoother.linear import linear
+from magmav.core.smoother.linear import leftover, linear
 from magmav.core.smoother.nodes import Nodes
 from magmav.core.smoother.noise import Noise
 from magmav.core.types import Estimate, Sample
@@ -136,10 +136,9 @@ class _Search:
 
     def _round(self) -> None:
         n = self.n
-        info, left = linear(self.nodes, self.x, self.noise, n)
         if self.solved:
-            self.noise = self.noise.seen(self.nodes, left, self.x, n)
-            info, left = linear(self.nodes, self.x, self.noise, n)
+            self.noise = self.noise.seen(self.nodes, leftover(self.nodes, self.x), self.x, n)
+        info, left = linear(self.nodes, self.x, self.noise, n)
         walks = sorted({m.iron_walk_mg for m in MODELS})
         chain = Chain(self.nodes, info, Way.of(self.nodes, self.noise, walks, self.opened, n))
         self.solved = [chain.solve(walks.index(m.iron_walk_mg), self.forth.field, m, n) for m in MODELS]

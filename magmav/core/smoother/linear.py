@@ -34,6 +34,16 @@ def linear(nodes: Nodes, x: Array, noise: Noise, n: Tuning) -> tuple[Array, Arra
     return info, left
 
 
+def leftover(nodes: Nodes, x: Array) -> Array:
+    """What a path (N, SIZE) leaves of each reading, (N, m, 3) mG."""
+    out = np.empty((*nodes.rows.shape, 3))
+    for a in range(0, len(nodes), _AT_ONCE):
+        part = slice(a, min(a + _AT_ONCE, len(nodes)))
+        r = nodes.readings(part.start, part.stop)
+        out[part] = r.z - equation(x[part], r)[0]
+    return out
+
+
 def _part(nodes: Nodes, part: slice, x: Array, noise: Noise, n: Tuning) -> tuple[Array, Array]:
     r, axes = nodes.readings(part.start, part.stop), nodes.columns.axes
     y, j, of_u = equation(x, r)
