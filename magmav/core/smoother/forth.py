@@ -73,6 +73,8 @@ class Forth(AdaptiveEstimator):
         out.boot_ns, out.believed = self.boot_ns[:count], self.believed[:count]
         out.notices = [notice for notice in self.notices if notice.to_ns <= end_ns]
         out._samples = int(nodes.there.sum())
+        drive = nodes.columns.drive[nodes.rows[nodes.there]]
+        out._drives = float(drive.mean()), float(drive.var())
         return out
 
     def says(self, bank: Bank, changed_ago_s: float, residual_mg: float, step_nis: float) -> Estimate | None:
