@@ -85,6 +85,15 @@ class Program:
                 if self._ended or left_s <= 0 or not self._more.wait(left_s):
                     raise AssertionError("\n".join([f"no {pattern!r} in", *self.lines[-60:]]))
 
+    def expect_all(self, *patterns: str) -> None:
+        """Each of these from here on, in whichever order; reading goes on after the last of them."""
+        begin, reached = self.read, self.read
+        for pattern in patterns:
+            self.read = begin
+            self.expect(pattern)
+            reached = max(reached, self.read)
+        self.read = reached
+
     def end(self) -> int:
         """Close its input and wait; the exit code."""
         assert self._run.stdin is not None

@@ -82,8 +82,7 @@ def test_mavproxy_fetches_sets_and_saves_our_parameters_and_sets_an_offset(tmp_p
         stage(tmp_path, GROUNDED) as hub,
         console(tmp_path, f"--master=udpout:127.0.0.1:{hub.port}", "--streamrate=-1") as mavproxy,
     ):
-        mavproxy.expect("Detected vehicle 1:1 ")
-        mavproxy.expect("Detected vehicle 1:191 ")
+        mavproxy.expect_all("Detected vehicle 1:1 ", "Detected vehicle 1:191 ")
         # The vehicle first. FTP off: the simulated autopilot has no files and MAVProxy would wait for them.
         mavproxy.say("set param_ftp False")
         mavproxy.say("vehicle 1:1")
