@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.boot import Boot
 from magmav.core.correction import iron_at_throttle
 from magmav.core.deviation import deviation_card
 from magmav.core.published import noise_of_heading
@@ -18,7 +19,7 @@ from magmav.core.smoothing import smooth
 from magmav.core.types import ZERO3, Heading, Record, Sample, Shaping, State, Vec3, vec3
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze, score_headings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Vehicle
 
 Result = dict[str, Any]
 Floats = NDArray[np.float64]

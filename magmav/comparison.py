@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.boot import Boot
 from magmav.channels import new_channel
 from magmav.core import gate
 from magmav.core.after_flight import after_flight
@@ -32,7 +33,7 @@ from magmav.recording import Keeper, NothingToLearnFrom, play
 from magmav.reference import Reference
 from magmav.score import Calibration, HeadingScore, Window, score_freeze
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 Result = dict[str, Any]
@@ -234,7 +235,7 @@ def compare(
     pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, idle=True)
     keeper = Keeper(pipeline, None)
     progress(f"{source}: reading")
-    play(recording, pipeline, [keeper])
+    play(recording, pipeline, keeper)
     earlier = keeper.bring_back()
     if not kept:
         found = ", ".join(f"{n} {k}" for k, n in recording.heard.most_common(6)) or "no message at all"

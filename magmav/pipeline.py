@@ -9,6 +9,7 @@ Live, replay and simulation run this and nothing else. It has no clock and no li
 from __future__ import annotations
 
 from magmav.core.estimators import ESTIMATORS
+from magmav.core.motion_run import MotionRun
 from magmav.core.published import Publisher
 from magmav.core.types import FieldModel, Reading, Record
 from magmav.settings import Settings
@@ -25,7 +26,7 @@ class Pipeline:
         self, settings: Settings, model: FieldModel, unix_offset_ns: int = 0, tap: Tap | None = None, idle: bool = False
     ) -> None:
         self.settings, self._model = settings, model
-        self._tap, self._idle, self._unix_offset_ns = tap, idle, unix_offset_ns
+        self._tap, self.idle, self._unix_offset_ns = tap, idle, unix_offset_ns
         self.vehicles: dict[int, Vehicle] = {}
         self._own: dict[int, Settings] = {}
         # Their libraries take seconds to load: now, not at the first sample.
@@ -48,8 +49,13 @@ class Pipeline:
 
     def step(self, reading: Reading, t_ns: int) -> Record | None:
         """Take one reading that arrived at t_ns; a Record when it was a fresh magnetometer value."""
-        vehicle, system = self.vehicles.get(reading.system), reading.system
-        if vehicle is None:
-            settings = self._own.get(system, self.settings)
-            vehicle = self.vehicles[system] = Vehicle(system, settings, self._model, self._tap, self._idle)
+        vehicle = self.vehicles.get(reading.system) or self._met(reading.system)
         return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)
+
+    def run(self, run: MotionRun) -> bool:
+        """Take many attitudes at once, see Vehicle.run."""
+        return (self.vehicles.get(run.system) or self._met(run.system)).run(run)
+
+    def _met(self, system: int) -> Vehicle:
+        held = self._own.get(system, self.settings)
+        return self.vehicles.setdefault(system, Vehicle(system, held, self._model, self._tap, self.idle))

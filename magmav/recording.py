@@ -6,19 +6,18 @@ the reading on everything is the path that flies.
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from magmav.appraisal import CompassLog, describe
+from magmav.boot import Boot
 from magmav.core.correction import stored_heading
+from magmav.core.motion_run import MotionRun
+from magmav.core.phase import Phase
 from magmav.core.types import AttitudeReading, FieldModel, MagReading, Reading, Record
 from magmav.hearing import LinkRecording
+from magmav.kept_attitudes import KeptAttitudes
 from magmav.link.tlog import TlogLink
 from magmav.logs import HEAD, LogError, Progress, Recording, kind_of
 from magmav.pipeline import Pipeline
@@ -26,7 +25,7 @@ from magmav.reference import Reference
 from magmav.service import Watcher, all_counts, hand_on
 from magmav.settings import Settings
 from magmav.tlog_recording import MOST_BYTES, TlogRecording
-from magmav.vehicle import Boot, Tap, Vehicle
+from magmav.vehicle import Tap, Vehicle
 
 Result = dict[str, Any]
 
@@ -68,28 +67,7 @@ class NothingToLearnFrom(Exception):
     """A recording without the messages that are needed; the text says which and what was found instead."""
 
 
-@dataclass(slots=True)
-class _Attitudes:
-    """One vehicle's attitudes since its last boot, of one message, in the order of time.
-
-    rows : (N, 6) boot time ns, roll, pitch, yaw rad, armed, airborne.
-    """
-
-    source: str = ""
-    latest_ns: int = -1
-    rows: array[float] = field(default_factory=lambda: array("d"))
-
-    def add(self, r: AttitudeReading, armed: bool, airborne: bool) -> None:
-        """Take the next."""
-        self.source, self.latest_ns = r.source, r.boot_ns
-        self.rows.extend((r.boot_ns, r.roll_rad, r.pitch_rad, r.yaw_rad, armed, airborne))
-
-    def table(self) -> NDArray[np.float64]:
-        """(N, 6)."""
-        return np.array(self.rows).reshape(-1, 6)
-
-
-_Past = tuple[dict[tuple[int, int], CompassLog], _Attitudes, Boot | None]
+_Past = tuple[dict[tuple[int, int], CompassLog], KeptAttitudes, Boot | None]
 """One boot: per compass, the attitudes, and what the vehicle held."""
 
 
@@ -100,7 +78,7 @@ class Keeper:
         self._pipeline = pipeline
         self._learn_for_s = learn_for_s
         self.compasses: dict[tuple[int, int], CompassLog] = {}
-        self._attitudes: dict[int, _Attitudes] = {}
+        self._attitudes: dict[int, KeptAttitudes] = {}
         self._reboots: dict[int, int] = {}
         self._past: dict[int, _Past] = {}
 
@@ -117,18 +95,26 @@ class Keeper:
         elif isinstance(reading, MagReading) and (record is not None or vehicle.unjudged is not None):
             self._mag(reading, record, vehicle)
 
-    def _attitude(self, r: AttitudeReading, vehicle: Vehicle) -> None:
-        kept = self._attitudes.get(r.system)
-        if kept is None:
-            kept = self._attitudes[r.system] = _Attitudes()
-        elif r.boot_ns <= kept.latest_ns or r.source != kept.source:
+    def run(self, run: MotionRun) -> None:
+        """Take many attitudes that went through the pipeline at once."""
+        vehicle = self._pipeline.vehicles[run.system]
+        vehicle.learn_for_s = self._learn_for_s
+        kept = self._attitudes.setdefault(run.system, KeptAttitudes())
+        if not kept.wants(run.attitudes.source, run.first_ns):
+            for i in range(run.begin, run.end):
+                self._attitude(run.attitudes.reading(i, run.system), vehicle)
             return
         phase = vehicle.phase
-        aloft = phase.aloft(r.boot_ns)
-        if phase.flyer:
-            kept.add(r, phase.armed, aloft and phase.crash_ns is None)
-        else:
-            kept.add(r, True, True)
+        aloft = phase.aloft_at(run.attitudes.boot_ns[run.begin : run.end])
+        change = run.begin + aloft.index(aloft[-1])  # time alone takes it up once, never down
+        for begin, end, up in ((run.begin, change, aloft[0]), (change, run.end, aloft[-1])):
+            if begin < end:
+                kept.add_rows(run.attitudes, begin, end, *_flags(phase, up))
+
+    def _attitude(self, r: AttitudeReading, vehicle: Vehicle) -> None:
+        kept = self._attitudes.setdefault(r.system, KeptAttitudes())
+        if kept.wants(r.source, r.boot_ns):
+            kept.add(r, *_flags(vehicle.phase, vehicle.phase.aloft(r.boot_ns)))
 
     def _mag(self, r: MagReading, record: Record | None, vehicle: Vehicle) -> None:
         key = r.system, r.compass
@@ -146,7 +132,7 @@ class Keeper:
     def _put_away(self, system: int, boot: Boot | None) -> None:
         """The vehicle rebooted: boot times begin again. A boot that taught something is kept until another one does."""
         logs = {key: self.compasses.pop(key) for key in [k for k in self.compasses if k[0] == system]}
-        past = (logs, self._attitudes.pop(system, _Attitudes()), boot)
+        past = (logs, self._attitudes.pop(system, KeptAttitudes()), boot)
         if boot is not None and any(log.learnt for log in logs.values()):
             self._past[system] = past
 
@@ -164,7 +150,7 @@ class Keeper:
 
     def reference(self, system: int, truth: Reference | None) -> Reference | None:
         """The truth file, or else the vehicle's own attitude over time; with the vehicle's phases of flight."""
-        kept = self._attitudes.get(system, _Attitudes())
+        kept = self._attitudes.get(system, KeptAttitudes())
         table = kept.table()
         boot_ns, roll, pitch, yaw = table[:, :4].T
         flags = table[:, 4:] > 0.0
@@ -174,6 +160,11 @@ class Keeper:
         if reference is None or flags.all():
             return reference
         return reference.with_flags(boot_ns / 1e9, flags[:, 0], flags[:, 1])
+
+
+def _flags(phase: Phase, aloft: bool) -> tuple[bool, bool]:
+    """Armed and airborne; both where it is not known to fly."""
+    return (phase.armed, aloft and phase.crash_ns is None) if phase.flyer else (True, True)
 
 
 def replay(
@@ -201,7 +192,7 @@ def replay(
     source = recording.name if source is None else source
     pipeline = Pipeline(settings, model, recording.unix_offset_ns, tap, idle)
     keeper = Keeper(pipeline, learn_for_s)
-    play(recording, pipeline, (keeper, *watchers), stop)
+    play(recording, pipeline, keeper, watchers, stop)
     earlier = keeper.bring_back()
     if not keeper.compasses:
         found = ", ".join(f"{n} {k}" for k, n in recording.heard.most_common(6)) or "no message at all"
@@ -232,11 +223,25 @@ def replay(
 
 
 def play(
-    recording: Recording, pipeline: Pipeline, watchers: Sequence[Watcher], stop: Callable[[], bool] = lambda: False
+    recording: Recording,
+    pipeline: Pipeline,
+    keeper: Keeper,
+    watchers: Sequence[Watcher] = (),
+    stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Every reading through the pipeline, until the end or until ``stop`` says so."""
-    for t_ns, reading in recording.readings():
-        hand_on(reading, t_ns, pipeline, watchers)
+    """Every reading through the pipeline, until the end or until ``stop`` says so.
+
+    Where the pipeline is idle and the recording can, attitudes go through it many at once; watchers do not see those.
+    """
+    watching: tuple[Watcher, ...] = (keeper, *watchers)
+    for t_ns, reading in recording.in_runs() if pipeline.idle else recording.readings():
+        if not isinstance(reading, MotionRun):
+            hand_on(reading, t_ns, pipeline, watching)
+        elif pipeline.run(reading):
+            keeper.run(reading)
+        else:
+            for one_ns, one in reading.one_by_one():
+                hand_on(one, one_ns, pipeline, watching)
         if stop():
             return
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from magmav.core.motion_run import AttitudeColumns, MotionRun, run_ends
 from magmav.core.types import Reading
 from magmav.logs import Progress
 from magmav.logs.tlog import TlogColumns, TlogTable, read_tlog
 from magmav.mavlink.decode import Decoder
-from magmav.mavlink.decode_bulk import Bulk, bulk
+from magmav.mavlink.decode_bulk import Attitudes, Bulk, bulk
 
 MOST_BYTES = 1 << 28
 """A longer file is heard packet by packet, in little memory: this one holds a few times the file's size."""
@@ -62,6 +64,52 @@ class _Rare:
         return decoder.readings(_Said(self._name, system, component, values, one.tobytes()))
 
 
+class _Script(NamedTuple):
+    """What is played when: of each message its time, kind, row, sender, and where a run that begins there ends."""
+
+    t_ns: list[int]
+    kinds: list[int]
+    rows: list[int]
+    systems: list[int]
+    components: list[int]
+    run_ends: list[int]
+    attitudes: AttitudeColumns | None
+    makers: list[Bulk]
+    decoder: Decoder
+
+    def one_by_one(self, begin: int, end: int) -> Iterator[tuple[int, Reading]]:
+        """The readings of these messages, their senders judged."""
+        for i in range(begin, end):
+            maker, system = self.makers[self.kinds[i]], self.systems[i]
+            if isinstance(maker, _Rare) or self.decoder.believes(system, self.components[i]):
+                for reading in maker.readings(self.rows[i], system, self.decoder):
+                    yield self.t_ns[i], reading
+
+    def believes(self, begin: int, end: int) -> bool:
+        """Whether the sender of a run counts; each of its messages is counted where it does not."""
+        system, component = self.systems[begin], self.components[begin]
+        if self.decoder.believes(system, component):
+            return True
+        for _ in range(begin + 1, end):
+            self.decoder.believes(system, component)
+        return False
+
+    def run(self, begin: int, end: int) -> MotionRun:
+        """Of a run's messages."""
+        row, columns = self.rows[begin], self.attitudes
+        if columns is None:
+            raise RuntimeError("nothing was read in runs")
+        until, again = row + end - begin, partial(self._again, begin, end)
+        times = columns.boot_ns
+        return MotionRun(self.systems[begin], columns, row, until, times[row], times[until - 1], again)
+
+    def _again(self, begin: int, end: int) -> Iterator[tuple[int, Reading]]:
+        """As one_by_one, their sender judged already."""
+        for i in range(begin, end):
+            for reading in self.makers[self.kinds[i]].readings(self.rows[i], self.systems[i], self.decoder):
+                yield self.t_ns[i], reading
+
+
 class TlogRecording:
     """Satisfies magmav.logs.Recording. Reads the file when made; LinkError as read_tlog's.
 
@@ -89,29 +137,47 @@ class TlogRecording:
 
     def readings(self) -> Iterator[tuple[int, Reading]]:
         """(t_ns, reading) in the order of arrival. Once through."""
+        for script in self._scripts(in_runs=False):
+            yield from script.one_by_one(0, len(script.t_ns))
+
+    def in_runs(self) -> Iterator[tuple[int, Reading | MotionRun]]:
+        """The same with attitudes in runs, see Recording.in_runs."""
+        for script in self._scripts(in_runs=True):
+            place, size = 0, len(script.t_ns)
+            while place < size:
+                end = script.run_ends[place]
+                if end <= place:
+                    end = place + 1
+                    yield from script.one_by_one(place, end)
+                elif script.believes(place, end):
+                    yield script.t_ns[place], script.run(place, end)
+                place = end
+
+    def _scripts(self, in_runs: bool) -> Iterator[_Script]:
+        """The whole recording, some thousand messages at a time."""
         columns, self._columns = self._columns, None
         if columns is None or not columns.by_name:
             return
         makers: list[Bulk] = []
-        rare = []
         for name, table in columns.by_name.items():
-            frequent = bulk(name, table.fields)
-            rare.append(frequent is None)
-            makers.append(_Rare(name, table) if frequent is None else frequent)
-        tables, decoder = list(columns.by_name.values()), self._decoder
+            makers.append(bulk(name, table.fields) or _Rare(name, table))
+        tables = list(columns.by_name.values())
         order = np.concatenate([table.order for table in tables])
         place = np.argsort(order, kind="stable")
         kinds = np.repeat(np.arange(len(tables)), [len(table) for table in tables])[place]
         rows = np.concatenate([np.arange(len(table)) for table in tables])[place]
         told = ("t_ns", "system", "component")
         t_ns, system, component = (np.concatenate([getattr(t, what) for t in tables])[place] for what in told)
+        attitudes, ends = None, np.zeros(len(place), dtype=np.int64)
+        for which, (maker, table) in enumerate(zip(makers, tables, strict=True)):
+            if in_runs and isinstance(maker, Attitudes):
+                attitudes = maker.columns(table.system.astype(np.int64) << 8 | table.component)
+                ends = run_ends(attitudes, np.where(kinds == which, rows, -1), np.full(len(place), -1))
         for begin in range(0, len(place), _EVERY):
             part = slice(begin, begin + _EVERY)
-            some = (column[part].tolist() for column in (t_ns, kinds, rows, system, component))
-            for t, kind, row, who, which in zip(*some, strict=True):
-                if rare[kind] or decoder.believes(who, which):
-                    for reading in makers[kind].readings(row, who, decoder):
-                        yield t, reading
+            t, kind, row, who, which = (column[part].tolist() for column in (t_ns, kinds, rows, system, component))
+            until = np.clip(ends[part] - begin, 0, len(t)).tolist()
+            yield _Script(t, kind, row, who, which, until, attitudes, makers, self._decoder)
             if self._progress is not None:
                 self._progress(self._size * min(begin + _EVERY, len(place)) // len(place), self._size)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from magmav.boot import Boot
 from magmav.channels import idle_channel, limits, new_channel
 from magmav.core.assemble import Assembler
 from magmav.core.causes import Causes
@@ -18,6 +19,7 @@ from magmav.core.correction import without_third
 from magmav.core.field import ExpectedField, FieldKeeper
 from magmav.core.handover import Handover
 from magmav.core.heading import UNKNOWN
+from magmav.core.motion_run import MotionRun
 from magmav.core.phase import Phase
 from magmav.core.published import Publisher, noise_of_heading
 from magmav.core.types import (
@@ -58,20 +60,6 @@ _SAY_FROZEN_NS = 1_000_000_000
 
 Tap = Callable[[Sample, Circumstances, tuple[int, int]], None]
 """Sees every Sample with its circumstances, and the number of boots and of new beginnings of its compass before it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Boot:
-    """What stays of the vehicle's time before a reboot: enough to judge what was learnt then."""
-
-    calibrations: StoredCalibrations
-    phase: Phase
-    began_ns: int | None
-    causes: Causes
-
-    def started_ns(self) -> int | None:
-        """Boot time of take-off, or of the first data where nothing flew."""
-        return self.began_ns
 
 
 class Vehicle:
@@ -160,6 +148,14 @@ class Vehicle:
         if self.assembler.reboots != self._reboots:
             self._after_reboot()
         return None
+
+    def run(self, run: MotionRun) -> bool:
+        """Take many attitudes at once; False, and nothing taken, where they have to be handed on one by one."""
+        if not self.assembler.run(run):
+            return False
+        roll, pitch, _ = run.attitudes.rows[run.end - 1, :3].tolist()
+        self.phase.tilt(roll, pitch, run.last_ns)  # all are upright
+        return True
 
     def _by_the_rules_of(self, autopilot: int) -> None:
         """What was undone by another autopilot's rules before does not mix with what is now."""

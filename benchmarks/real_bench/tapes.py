@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from magmav.appraisal import CompassLog
+from magmav.boot import Boot
 from magmav.core.channel import Circumstances
 from magmav.core.types import CurrentReading, MagReading, Reading, Record, Sample, ThrottleReading, Vec3
 from magmav.geomag import world_magnetic_model
@@ -17,7 +18,7 @@ from magmav.pipeline import Pipeline
 from magmav.recording import Keeper, open_recording, play
 from magmav.reference import Reference
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Vehicle
 
 DATA = Path(os.environ.get("MAGMAV_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

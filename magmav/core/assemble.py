@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from magmav.core.motion import Motion
+from magmav.core.motion_run import MotionRun
 from magmav.core.types import AttitudeReading, InertialReading, MagReading, Sample, Shaping, Vec3
 
 _BACK_NS = 2_000_000_000  # further back than any reordering: a reboot
@@ -67,6 +68,17 @@ class BootClock:
             return Tick.REBOOT if ahead < 0 else Tick.JUMP
         self._doubt_ns = boot_ns
         return Tick.DOUBT
+
+    def hears(self, first_ns: int, last_ns: int) -> bool:
+        """Boot times that rise by steps well under a pause, first to last, where they go on; False: hear them apart."""
+        if self.latest_ns is not None:
+            ahead = first_ns - self.latest_ns
+            if not -_BACK_NS <= ahead <= _AHEAD_NS:
+                return False
+            if last_ns <= self.latest_ns:
+                return True
+        self.latest_ns, self._doubt_ns = last_ns, None
+        return True
 
 
 @dataclass(slots=True)
@@ -141,6 +153,13 @@ class Assembler:
         """Take accelerometer and gyro: the tilt of a vehicle that sends no attitude."""
         if self._in_time(reading.boot_ns):
             self.motion.inertial(reading)
+
+    def run(self, run: MotionRun) -> bool:
+        """Take many attitudes at once; False, and nothing taken, where they have to be heard one by one."""
+        if not self.motion.follows(run) or not self.clock.hears(run.first_ns, max(run.last_ns, *run.inertial_ns)):
+            return False
+        self.motion.run(run)
+        return True
 
     def frozen_s(self, compass: int) -> float:
         """Seconds of turning (over 30 degrees) during which this compass never changed its value, else 0."""

@@ -7,13 +7,14 @@ steps): the autopilot's yaw follows the compass that is being judged, so its val
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
+from magmav.core.lately import Heard, Lately
 from magmav.core.marg_attitude import Carried, MargAttitude
-from magmav.core.own_frame import Frame, Vector, carried, levelled, matrix, of_attitude, stepped
+from magmav.core.motion_run import RATES_HOLD_S, MotionRun
+from magmav.core.own_frame import carried, levelled, matrix, of_attitude, stepped
 from magmav.core.rotation import (
     cross_matrix,
     euler_rates,
@@ -26,8 +27,8 @@ from magmav.core.tilt_doubt import TiltDoubt
 from magmav.core.types import ZERO3, AttitudeReading, InertialReading, Mat3, Vec3
 
 _FRESH_NS = 600_000_000  # an attitude older than this is not extrapolated (estimation.md section 5)
-_RATES_HOLD_S = 0.25  # between attitudes further apart, rates say nothing: take the yaw step itself
 _LOST_S = 5.0
+_RECENT = 12
 _TILT_TAU_S = 3.0  # accelerometer corrects the gyro's tilt with this time constant
 _G = 9.80665
 
@@ -51,17 +52,6 @@ class MotionState(NamedTuple):
     every_s: float = 0.0  # between the last two readings it is from
 
 
-class _Heard(NamedTuple):
-    """One attitude, with what was integrated up to it."""
-
-    boot_ns: int
-    reading: AttitudeReading
-    rate_b_rads: Vector
-    euler_rads: Vector  # rates of roll, pitch and yaw
-    yaw_rad: float
-    own_frame: Frame
-
-
 class Motion:
     """Keeps the latest tilt of one vehicle.
 
@@ -70,8 +60,7 @@ class Motion:
 
     def __init__(self, own: str = "complementary") -> None:
         self.seen_attitude = False
-        self._last: _Heard | None = None
-        self._recent: deque[_Heard] = deque(maxlen=12)
+        self._lately = Lately()
         self._epoch = 0
         self._every_s = 0.0
         self._inertial_ns: int | None = None
@@ -90,9 +79,13 @@ class Motion:
         frame is turned on by the gyro, then made level with the attitude by the shortest way: no angle is singular,
         and a tail-sitter standing on its tail is like any other.
         """
-        last = self._last
-        if last is not None and r.boot_ns <= last.boot_ns:
+        if not self._lately.before(r.boot_ns):
             return False
+        self._hear(r)
+        return True
+
+    def _hear(self, r: AttitudeReading) -> Heard:
+        last = self._lately.newest()
         x, y, z = r.rate_b_rads.tolist()
         cr, sr, cp, sp = math.cos(r.roll_rad), math.sin(r.roll_rad), math.cos(r.pitch_rad), math.sin(r.pitch_rad)
         euler = euler_rates_at(cr, sr, cp, sp, x, y, z)
@@ -100,7 +93,7 @@ class Motion:
         self._every_s = min(dt, _LOST_S)
         if last is None:
             yaw, frame = 0.0, of_attitude(r.roll_rad, r.pitch_rad, 0.0)
-        elif dt <= _RATES_HOLD_S:
+        elif dt <= RATES_HOLD_S:
             yaw = last.yaw_rad + 0.5 * (last.euler_rads[2] + euler[2]) * dt
             p, q, w = last.rate_b_rads
             frame = carried(last.own_frame, (0.5 * (p + x), 0.5 * (q + y), 0.5 * (w + z)), dt)
@@ -113,20 +106,40 @@ class Motion:
                 frame = stepped(last.own_frame, of_attitude(was.roll_rad, was.pitch_rad, was.yaw_rad), now)
             else:
                 self._epoch += 2
-                self._recent.clear()
-        self._last = _Heard(r.boot_ns, r, (x, y, z), euler, yaw, frame)
-        self._recent.append(self._last)
-        self._asked = None
-        self.seen_attitude = True
-        return True
+                self._lately.clear()
+        out = Heard(r.boot_ns, r, (x, y, z), euler, yaw, frame)
+        self._lately.add(out)
+        self._asked, self.seen_attitude = None, True
+        return out
+
+    def follows(self, r: MotionRun) -> bool:
+        """Is it later than all that was heard?"""
+        return self._lately.before(r.first_ns)
+
+    def run(self, r: MotionRun) -> None:
+        """Take many at once, where they follow."""
+        columns, self._asked = r.attitudes, None
+        row = r.begin
+        while row < r.end and not self._lately.goes_on(r, row):
+            self._lately.go(r, row, self._hear(columns.reading(row, r.system)))
+            row += 1
+        if row < r.end:
+            self._every_s = self._lately.until(r.end)
+        latest, before = r.inertial_ns
+        if latest >= 0:
+            before = before if before >= 0 or self._inertial_ns is None else self._inertial_ns
+            if 0 <= before < latest:
+                self._inertial_every_s = min((latest - before) / 1e9, _LOST_S)
+            self._inertial_ns = latest
+            self._own.seed(columns.reading(r.before_inertial, r.system))
 
     def inertial(self, r: InertialReading) -> None:
         """Take accelerometer and gyro. While attitudes come, they only mark where own tilt would start from."""
-        last = self._last
         self._asked = None
         if self._inertial_ns is not None and r.boot_ns > self._inertial_ns:
             self._inertial_every_s = min((r.boot_ns - self._inertial_ns) / 1e9, _LOST_S)
         self._inertial_ns = r.boot_ns
+        last = self._lately.newest()
         if last is not None and r.boot_ns - last.boot_ns <= _FRESH_NS:
             self._own.seed(last.reading)
         else:
@@ -148,41 +161,26 @@ class Motion:
     @property
     def rate_rads(self) -> float:
         """Length of the newest body rate, rad/s, 0 when nothing is known."""
-        last = self._last
+        last = self._lately.newest()
         x, y, z = self._own.rate_b_rads.tolist() if last is None else last.rate_b_rads
         return math.hypot(x, y, z)
 
     def at(self, boot_ns: int) -> MotionState | None:
         """Tilt and turning at a boot time close to the newest reading; None when nothing is fresh enough."""
         if self._asked is None or self._asked[0] != boot_ns:
-            heard = self._nearest(boot_ns)
+            heard = self._lately.nearest(boot_ns, _FRESH_NS)
             self._asked = boot_ns, self._by_own(boot_ns) if heard is None else self._by(heard, boot_ns)
         return self._asked[1]
 
     def yaw_at(self, boot_ns: int) -> tuple[float, int] | None:
         """Yaw and epoch of ``at``."""
-        heard = self._nearest(boot_ns)
+        heard = self._lately.nearest(boot_ns, _FRESH_NS)
         if heard is not None:
             return heard.yaw_rad + heard.euler_rads[2] * ((boot_ns - heard.boot_ns) / 1e9), self._epoch
         own = self._own.at(boot_ns)
         return None if own is None else (own.yaw_rad, own.epoch)
 
-    def _nearest(self, boot_ns: int) -> _Heard | None:
-        """The attitude nearest to a boot time, of equals the earlier; None where the newest is not fresh."""
-        heard = self._last
-        if heard is None:
-            return None
-        away = abs(boot_ns - heard.boot_ns)
-        if away > _FRESH_NS:
-            return None
-        for earlier in reversed(self._recent):
-            further = abs(boot_ns - earlier.boot_ns)
-            if further > away:
-                break
-            heard, away = earlier, further
-        return heard
-
-    def _by(self, heard: _Heard, boot_ns: int) -> MotionState:
+    def _by(self, heard: Heard, boot_ns: int) -> MotionState:
         a, age, (dr, dp, dy) = heard.reading, (boot_ns - heard.boot_ns) / 1e9, heard.euler_rads
         return MotionState(
             a.roll_rad + dr * age,

@@ -31,8 +31,13 @@ def of_attitude(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Frame:
 
 def stepped(frame: Frame, before: Frame, after: Frame) -> Frame:
     """After a step of attitude from ``before`` to ``after``, both as of_attitude gives them."""
-    w, x, y, z = before
-    return _product(_product(after, (w, -x, -y, -z)), frame)
+    return product(product(after, inverse(before)), frame)
+
+
+def inverse(frame: Frame) -> Frame:
+    """From body axes to the frame."""
+    w, x, y, z = frame
+    return w, -x, -y, -z
 
 
 def carried(frame: Frame, rate_b_rads: Vector, dt_s: float) -> Frame:
@@ -83,7 +88,7 @@ def matrix(frame: Frame) -> Mat3:
     return np.frombuffer(rows).reshape(3, 3)  # takes a third of what an array of tuples does
 
 
-def _product(p: Frame, q: Frame) -> Frame:
+def product(p: Frame, q: Frame) -> Frame:
     """First q, then p."""
     a, b, c, d = p
     w, x, y, z = q

@@ -8,6 +8,7 @@ flight: afterwards it is being carried away, past whatever steel there is, and f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from magmav.core.handling import Handling
@@ -111,6 +112,14 @@ class Phase:
         elif self.armed and self._stands(boot_ns):
             self._down(boot_ns)
         return up
+
+    def aloft_at(self, boot_ns: Sequence[int]) -> list[bool]:
+        """``aloft`` at each of these rising times, at least one, between which nothing else was heard."""
+        first = self.aloft(boot_ns[0])
+        in_time = self._low_since_ns is not None or (self._height_m is None and self._landed is None)
+        if self.armed and in_time:  # time alone may change it
+            return [first, *map(self.aloft, boot_ns[1:])]
+        return [first] * len(boot_ns)
 
     def _up(self, boot_ns: int) -> None:
         """In the air: a take-off, unless this flight has had its own."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from magmav import __version__
+from magmav.boot import Boot
 from magmav.core.types import FieldModel
 from magmav.fitting.answer import answer
 from magmav.fitting.case import Case, Told, solve
@@ -23,7 +24,7 @@ from magmav.logs import HEAD, Progress, kind_of
 from magmav.recording import open_recording, replay
 from magmav.reference import Reference
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Vehicle
 
 Result = dict[str, Any]
 _CHUNK = 1 << 20

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.boot import Boot
 from magmav.comparison import Columns, Tape, first_half
 from magmav.core.after_flight import AfterFlight, after_flight
 from magmav.core.correction import field_of, iron_of_offsets
@@ -18,7 +19,7 @@ from magmav.fitting import cut
 from magmav.fitting.tape import Currents, settled_after
 from magmav.reference import Reference
 from magmav.settings import Settings
-from magmav.vehicle import Boot, Vehicle
+from magmav.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

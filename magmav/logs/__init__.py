@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+from magmav.core.motion_run import MotionRun
 from magmav.core.types import Reading
 
 Progress = Callable[[int, int], None]
@@ -91,6 +92,10 @@ class Recording(Protocol):
 
     def readings(self) -> Iterator[tuple[int, Reading]]:
         """(t_ns, reading) in the order of time; t_ns is the vehicle's boot clock. Once through."""
+        ...
+
+    def in_runs(self) -> Iterator[tuple[int, Reading | MotionRun]]:
+        """The same, with attitudes that follow each other as runs, where the file is read by columns. Instead of it."""
         ...
 
     def close(self) -> None:

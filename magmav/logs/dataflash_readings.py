@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from magmav.core.motion_run import MotionRun
 from magmav.core.types import Reading
 from magmav.logs import HEAD, LogError, Progress, kind_of, open_log
 from magmav.logs import dataflash_sensors as sensors
@@ -20,6 +21,7 @@ from magmav.logs import dataflash_vehicle as vehicle
 from magmav.logs.columns import Ints
 from magmav.logs.dataflash import SYNC, read_binary
 from magmav.logs.dataflash_clock import clock_of
+from magmav.logs.dataflash_runs import Order, Runs
 from magmav.logs.dataflash_series import Log, Stream
 from magmav.logs.dataflash_text import read_text
 
@@ -40,6 +42,7 @@ class DataflashRecording:
         self.name = f"dataflash:{path}"
         self.counts: Counter[str] = Counter()
         self._progress = progress
+        self._told = -1
         self._streams: list[Stream] = []
         self._shift_ns: list[int] = []
         log = _open(Path(path), self.counts)
@@ -49,17 +52,37 @@ class DataflashRecording:
 
     def readings(self) -> Iterator[tuple[int, Reading]]:
         """(t_ns, reading) in the order of time, once through."""
-        streams, self._streams = self._streams, []
-        boot, ns, rank, at, stream, row = _in_order(streams)
-        t_ns = (ns + np.array(self._shift_ns or [0], dtype=np.int64)[boot]).tolist()
-        del boot, ns, rank, at
+        streams, order = self._played()
         makers = [s.make for s in streams]
-        for done, (t, which, i) in enumerate(zip(t_ns, stream.tolist(), row.tolist(), strict=True)):
-            if self._progress is not None and done % _EVERY == 0:
-                self._progress(done, len(t_ns))
+        for done, (t, which, i) in enumerate(zip(*(column.tolist() for column in order), strict=True)):
+            self._tell(done, len(order.t_ns))
             yield t, makers[which](i)
-        if self._progress is not None:
-            self._progress(len(t_ns), len(t_ns))
+        self._tell(len(order.t_ns), len(order.t_ns), at_once=True)
+
+    def in_runs(self) -> Iterator[tuple[int, Reading | MotionRun]]:
+        """The same with attitudes in runs, see Recording.in_runs."""
+        streams, order = self._played()
+        runs = Runs(streams, order)
+        t_ns, stream, row = (column.tolist() for column in order)
+        makers, place, size = [s.make for s in streams], 0, len(t_ns)
+        while place < size:
+            self._tell(place, size)
+            run = runs.at(place)
+            yield t_ns[place], makers[stream[place]](row[place]) if run is None else run
+            place = place + 1 if run is None else runs.ends[place]
+        self._tell(size, size, at_once=True)
+
+    def _tell(self, done: int, size: int, at_once: bool = False) -> None:
+        """The progress, now and then."""
+        if self._progress is not None and (at_once or done // _EVERY != self._told):
+            self._told = done // _EVERY
+            self._progress(done, size)
+
+    def _played(self) -> tuple[list[Stream], Order]:
+        """What was read, let go of here, and in which order it is played."""
+        streams, self._streams, self._told = self._streams, [], -1
+        boot, ns, _, _, stream, row = _in_order(streams)
+        return streams, Order(ns + np.array(self._shift_ns or [0], dtype=np.int64)[boot], stream, row)
 
     def close(self) -> None:
         """Let go of what was read. Safe to call twice."""

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.motion_run import AttitudeColumns, attitude_columns
 from magmav.core.types import AttitudeReading, InertialReading, MagReading, Reading
 from magmav.logs.columns import Floats
 from magmav.logs.dataflash_series import Log, Pick, Series, Stream, chosen, triples
@@ -60,7 +61,7 @@ def inertial(log: Log, system: int) -> list[Stream]:
     def make(i: int) -> Reading:
         return InertialReading(system, "IMU", ns[i], forces[i], rates[i])
 
-    return [Stream(series.when, make)]
+    return [Stream(series.when, make, inertial=True)]
 
 
 def attitude(log: Log, system: int) -> list[Stream]:
@@ -84,7 +85,11 @@ def attitude(log: Log, system: int) -> list[Stream]:
         roll, pitch, yaw = rows[i]
         return AttitudeReading(system, name, ns[i], roll, pitch, yaw, vectors[i])
 
-    return [Stream(series.when, make)]
+    def columns() -> AttitudeColumns:
+        held = np.array(vectors).reshape(-1, 3)
+        return attitude_columns(name, series.when.ns, angles, held, np.ones(len(held), dtype=bool), series.when.boot)
+
+    return [Stream(series.when, make, attitudes=columns)]
 
 
 def body_rates(log: Log, attitudes: Series) -> tuple[Floats, NDArray[np.bool_]]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.motion_run import AttitudeColumns
 from magmav.core.types import Reading
 from magmav.logs.columns import WHOLE, Floats, Ints, Table, Tables
 from magmav.logs.dataflash_clock import Clock, Moments
@@ -45,11 +46,16 @@ class Series:
 
 
 class Stream(NamedTuple):
-    """Readings of one kind: make(i) is the one of the i-th moment. Of equal times the lower rank goes first."""
+    """Readings of one kind: make(i) is the one of the i-th moment. Of equal times the lower rank goes first.
+
+    attitudes : makes columns of them, of attitudes.  inertial : whether they are of accelerometer and gyro.
+    """
 
     when: Moments
     make: Callable[[int], Reading]
     rank: int = 2
+    attitudes: Callable[[], AttitudeColumns] | None = None
+    inertial: bool = False
 
 
 class Log(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magmav.core.motion_run import AttitudeColumns, attitude_columns
 from magmav.core.types import AttitudeReading, InertialReading, MagReading, Reading
 from magmav.mavlink.decode import COMPASS_OF, END_OF_SCALE, EPOCH_US, MOST_RAD, MOST_RADS, MS, US, Decoder, G
 
@@ -31,11 +32,13 @@ class Bulk(Protocol):
 def bulk(name: str, fields: NDArray[Any]) -> Bulk | None:
     """For a kind that is frequent; None for any other. fields : (N,) structured, names as MAVLink's."""
     if name == "ATTITUDE":
-        return _Attitudes(fields)
+        return Attitudes(fields)
     return _Imus(name, fields) if name in COMPASS_OF else None
 
 
-class _Attitudes:
+class Attitudes:
+    """ATTITUDE. Satisfies Bulk."""
+
     def __init__(self, f: NDArray[Any]) -> None:
         self._rate = _frozen(f, ("rollspeed", "pitchspeed", "yawspeed"))
         angles = _frozen(f, ("roll", "pitch", "yaw"))
@@ -43,6 +46,11 @@ class _Attitudes:
         self._fault: list[int] = np.where(of_rate != _FINE, of_rate, _judged(angles, MOST_RAD)).tolist()
         self._angles = angles.tolist()
         self._boot_ns: list[int] = (f["time_boot_ms"].astype(np.int64) * MS).tolist()
+
+    def columns(self, sender: NDArray[np.int64]) -> AttitudeColumns:
+        """All of them, for runs. sender : (N,) which vehicle's component sent each."""
+        boot_ns, good = np.array(self._boot_ns, dtype=np.int64), np.array(self._fault) == _FINE
+        return attitude_columns("ATTITUDE", boot_ns, np.array(self._angles).reshape(-1, 3), self._rate, good, sender)
 
     def readings(self, row: int, system: int, decoder: Decoder) -> list[Reading]:
         """One attitude, where it is one."""
