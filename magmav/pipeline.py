@@ -39,9 +39,8 @@ class Pipeline:
             self.settings, self._own = settings, {}
         else:
             self._own[system] = settings
-        for vehicle in self.vehicles.values():
-            if system in (None, vehicle.system):
-                vehicle.apply(settings)
+        for vehicle in (v for v in self.vehicles.values() if system in (None, v.system)):
+            vehicle.apply(settings)
 
     def forget(self, system: int) -> None:
         """What was learnt of this vehicle no longer counts: it is gone, or was heard from somewhere else."""
@@ -49,8 +48,8 @@ class Pipeline:
 
     def step(self, reading: Reading, t_ns: int) -> Record | None:
         """Take one reading that arrived at t_ns; a Record when it was a fresh magnetometer value."""
-        vehicle = self.vehicles.get(reading.system) or self._met(reading.system)
-        return vehicle.step(reading, t_ns, t_ns + self._unix_offset_ns)
+        who, unix_ns = reading.system, t_ns + self._unix_offset_ns
+        return (self.vehicles.get(who) or self._met(who)).step(reading, t_ns, unix_ns)
 
     def run(self, run: MotionRun) -> bool:
         """Take many attitudes at once, see Vehicle.run."""

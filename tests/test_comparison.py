@@ -12,7 +12,7 @@ from magmav.comparison import METHODS, SMOOTHED, Tape, compare
 from magmav.core.estimators import ESTIMATORS
 from magmav.hearing import LinkRecording
 from magmav.pipeline import Pipeline
-from magmav.recording import NothingToLearnFrom, play, replay
+from magmav.recording import Keeper, NothingToLearnFrom, play, replay
 from magmav.settings import Settings
 from magmav.view.compare import compare_view
 from magmav.view.table import to_text
@@ -143,7 +143,7 @@ def test_the_table_shows_every_method_and_says_what_is_not_known(compared):
 def test_a_tape_keeps_the_last_stretch_that_taught():
     samples = []
     pipeline = Pipeline(Settings(), earth_model, UNIX_NS, lambda s, c, k: samples.append((s, c)))
-    play(told(flight(seconds=4.0)), pipeline, ())
+    play(told(flight(seconds=4.0)), pipeline, Keeper(pipeline, None))
     sample, circumstances = samples[-1]
     quiet = type(sample)(**{f: getattr(sample, f) for f in sample.__dataclass_fields__} | {"learn": False})
     tape = Tape()

@@ -192,10 +192,10 @@ def test_AT_10b_where_no_power_is_known_that_is_said_and_the_iron_is_that_of_ave
     from magmav.core.types import CurrentReading, ThrottleReading
     from magmav.logs.dataflash_readings import DataflashRecording
 
-    readings = DataflashRecording.readings
+    readings = DataflashRecording.in_runs
     powers = (CurrentReading, ThrottleReading)
     monkeypatch.setattr(
-        DataflashRecording, "readings", lambda self: (r for r in readings(self) if not isinstance(r[1], powers))
+        DataflashRecording, "in_runs", lambda self: (r for r in readings(self) if not isinstance(r[1], powers))
     )
     fit = only(magmav.fit(motor_log, options=ASK))["fit"]
     assert fit["hard_iron_at"] == "average power" and not fit["motor"]["earned"]

@@ -34,7 +34,10 @@ def imports(name: str) -> Iterator[str]:
                 yield full if full in SOURCES else base
 
 
-CORE_FOR_READERS = ("magmav.core.types", "magmav.core.reasons", "magmav.core.rotation", "magmav.core.orientation")
+CORE_FOR_READERS = (
+    *("magmav.core.types", "magmav.core.reasons", "magmav.core.rotation", "magmav.core.orientation"),
+    "magmav.core.motion_run",  # what columns of attitudes are handed on as
+)
 
 # Package: what it may import of ours, and of others' (None: anything installed).
 STOREYS = {

@@ -91,7 +91,7 @@ def tapes(recording: Recording, name: str, settings: Settings | None = None) -> 
 
     pipeline = Pipeline(settings, world_magnetic_model, recording.unix_offset_ns, tap, idle=True)
     keeper = Keeper(pipeline, None)
-    play(recording, pipeline, [keeper, keep])
+    play(recording, pipeline, keeper, (keep,))
     earlier = keeper.bring_back()
     out = []
     for system in sorted({s for s, _ in keeper.compasses}):
