@@ -62,14 +62,16 @@ class DataflashRecording:
     def in_runs(self) -> Iterator[tuple[int, Reading | MotionRun]]:
         """The same with attitudes in runs, see Recording.in_runs."""
         streams, order = self._played()
-        runs = Runs(streams, order)
-        t_ns, stream, row = (column.tolist() for column in order)
-        makers, place, size = [s.make for s in streams], 0, len(t_ns)
-        while place < size:
-            self._tell(place, size)
-            run = runs.at(place)
-            yield t_ns[place], makers[stream[place]](row[place]) if run is None else run
-            place = place + 1 if run is None else runs.ends[place]
+        runs, makers = Runs(streams, order), [s.make for s in streams]
+        place, size = 0, len(order.t_ns)
+        for begin in range(0, size, _EVERY):
+            self._tell(begin, size)
+            some = (column[begin : begin + _EVERY].tolist() for column in (*order, runs.ends))
+            for here, (t, which, i, end) in enumerate(zip(*some, strict=True), begin):
+                if here < place:
+                    continue  # it was in a run
+                place = max(end, here + 1)
+                yield t, runs.at(here) if end > here else makers[which](i)
         self._tell(size, size, at_once=True)
 
     def _tell(self, done: int, size: int, at_once: bool = False) -> None:

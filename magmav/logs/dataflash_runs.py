@@ -25,12 +25,12 @@ class Order(NamedTuple):
 class Runs:
     """Where runs begin in an Order.
 
-    ends : past the last reading of the run that begins at a place, 0 where none does.
+    ends : (N,) past the last reading of the run that begins at a place, 0 where none does.
     """
 
     def __init__(self, streams: Sequence[Stream], order: Order) -> None:
         self._order, self._makers = order, [s.make for s in streams]
-        self.ends: list[int] = [0] * len(order.row)
+        self.ends: Ints = np.zeros(len(order.row), dtype=np.int64)
         which = next((i for i, s in enumerate(streams) if s.attitudes is not None and len(s.when.ns)), None)
         made = None if which is None else streams[which].attitudes
         if which is None or made is None:
@@ -41,26 +41,22 @@ class Runs:
         for i, stream in enumerate(streams):
             if stream.inertial:
                 inertial_ns[order.stream == i] = stream.when.ns[order.row[order.stream == i]]
-        self.ends = run_ends(self._columns, np.where(is_attitude, order.row, -1), inertial_ns).tolist()
-        self._row: list[int] = order.row.tolist()
-        self._inertial_ns: list[int] = inertial_ns.tolist()
-        self._attitudes_before: list[int] = np.concatenate(([0], np.cumsum(is_attitude))).tolist()
-        self._inertial_before: list[int] = previous(np.append(inertial_ns >= 0, False)).tolist()
+        self.ends = run_ends(self._columns, np.where(is_attitude, order.row, -1), inertial_ns)
+        self._inertial_ns = inertial_ns
+        self._attitudes_before = np.concatenate(([0], np.cumsum(is_attitude)))
+        self._inertial_before = previous(np.append(inertial_ns >= 0, False))
 
-    def at(self, place: int) -> MotionRun | None:
+    def at(self, place: int) -> MotionRun:
         """The run that begins here."""
-        end = self.ends[place]
-        if end <= place:
-            return None
-        many, row = self._attitudes_before, self._row[place]
-        ns, before_inertial, last = (-1, -1), -1, self._inertial_before[end]
+        end, row = int(self.ends[place]), int(self._order.row[place])
+        row_less = row - int(self._attitudes_before[place])
+        ns, before_inertial, last = (-1, -1), -1, int(self._inertial_before[end])
         if last > place:  # a run begins with an attitude
-            earlier = self._inertial_before[last]
-            ns = self._inertial_ns[last], self._inertial_ns[earlier] if earlier > place else -1
-            before_inertial = row + many[last] - many[place] - 1
-        until = row + many[end] - many[place]
+            earlier = int(self._inertial_before[last])
+            ns = int(self._inertial_ns[last]), int(self._inertial_ns[earlier]) if earlier > place else -1
+            before_inertial = row_less + int(self._attitudes_before[last]) - 1
+        until, times = row_less + int(self._attitudes_before[end]), self._columns.boot_ns
         again = partial(self._one_by_one, place, end)
-        times = self._columns.boot_ns
         ends = times[row], times[until - 1]
         return MotionRun(self._system, self._columns, row, until, *ends, again, ns, before_inertial)
 
