@@ -65,6 +65,10 @@ class WithAttitude:
                 yield t_ns, AttitudeReading(reading.system, "ATTITUDE", boot_ns, roll, pitch, yaw, rates[i])
             yield t_ns, reading
 
+    def in_runs(self) -> Iterator[tuple[int, Reading]]:
+        """The same: an attitude comes with every reading of the IMU."""
+        return self.readings()
+
     def close(self) -> None:
         """Let go."""
         self._inner.close()

@@ -23,7 +23,8 @@ from magmav.core.estimators import Estimator, Idle
 from magmav.core.excitation import Excitation
 from magmav.core.field import ExpectedField
 from magmav.core.heading import UNKNOWN, heading_sigma, level_field, magnetic_heading
-from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Sample, State, Vec3, Verdict, vec3
+from magmav.core.steadiness import Stood, Worsening
+from magmav.core.types import ZERO3, AxisState, Estimate, Heading, Mat3, Reason, Sample, State, Vec3, Verdict, vec3
 
 _TILT_SIGMA_RAD = math.radians(0.7)  # of an autopilot's attitude in flight
 _OWN_TILT_SIGMA_RAD = math.radians(2.0)  # of gyro and accelerometer alone, at least
@@ -115,6 +116,7 @@ class Channel:
         self._field_mg = self._level_mg = 0.0
         self._belief: _Belief | None = None
         self._resume = False
+        self._stood, self._worsening = Stood(), Worsening()
 
     def step(self, s: Sample, sent_b_mg: Vec3, c: Circumstances) -> Finding:
         """Take one sample, and the same value as the autopilot sent it."""
@@ -232,6 +234,7 @@ class Channel:
             apart=self._apart,
             left_mg=self._left(e, c, sigma_mg),
             steady=steady or (e is not None and self._steady(s.boot_ns, e, sigma_mg)),
+            worse=e is not None and self._worsening.step(s.boot_ns, e.residual_mg),
             sectors=self._excitation.sectors,
             frozen_s=c.frozen_s,
             has_attitude=s.tilt_from == "ATTITUDE",
@@ -241,4 +244,8 @@ class Channel:
             grounded=c.grounded,
             axes=s.axes,
         )
-        self.verdict = gate.judge(evidence, self.limits, self.verdict.state)
+        verdict = gate.judge(evidence, self.limits, self.verdict.state)
+        stood = self._stood.step(s.boot_ns, verdict.state is State.READY)
+        if verdict.state is State.READY and not (stood or self.held):
+            verdict = Verdict(State.LEARNING, verdict.axes, (Reason.STILL_MOVING, *verdict.reasons))
+        self.verdict = verdict

@@ -57,6 +57,7 @@ class Evidence:
     grounded: bool  # a flying vehicle that has not flown yet, and nobody said that the bench will do
     apart: float = 0.0  # sigmas between two opinions, as they lately were
     left_mg: float = 0.0  # level field that a down axis not written leaves wrong, at the tilt flown
+    worse: bool = False  # the readings fit worse than they lately did
     axes: int = 3  # 2: the third component of the field comes from the dip, or is missing without a position
 
 
@@ -138,7 +139,7 @@ def _missing(
         out.append(Reason.HEADING_UNSURE)
     if e.apart > (_APART_BLIND if e.expected is None else _APART) * slack:
         out.append(Reason.OPINIONS_DIFFER)
-    if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS:
+    if estimate.changed_ago_s < limits.change_s or estimate.step_nis > _STRANGE_NIS or e.worse:
         out.append(Reason.JUST_CHANGED)
     if not e.steady:
         out.append(Reason.STILL_MOVING)
