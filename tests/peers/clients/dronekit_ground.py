@@ -10,6 +10,14 @@ import time
 from dronekit import connect
 
 
+def settled(vehicle, name, value):
+    """The value a moment later: a PARAM_VALUE of the list, on its way when the set was, is taken for its answer."""
+    end = time.monotonic() + 5.0
+    while vehicle.parameters[name] != value and time.monotonic() < end:
+        time.sleep(0.1)
+    return vehicle.parameters[name]
+
+
 def main():
     vehicle = connect(f"udpout:127.0.0.1:{sys.argv[1]}", wait_ready=["parameters"], timeout=60)
     out = {"armed": vehicle.armed}
@@ -24,9 +32,9 @@ def main():
     out["ours"] = len(ours)
     out["before"] = vehicle.parameters["MMAG_LEARN"]
     out["set"] = vehicle.parameters.set("MMAG_LEARN", 0.0, retries=3)
-    out["after"] = vehicle.parameters["MMAG_LEARN"]
+    out["after"] = settled(vehicle, "MMAG_LEARN", 0.0)
     out["vehicle set"] = vehicle.parameters.set("COMPASS_OFS_Z", 11.5, retries=3)
-    out["vehicle after"] = vehicle.parameters["COMPASS_OFS_Z"]
+    out["vehicle after"] = settled(vehicle, "COMPASS_OFS_Z", 11.5)
     # A trigger wants exactly our component: dronekit2 cannot give it, and is told the old value.
     out["trigger"] = vehicle.parameters.set("MMAG_UPLOAD", 1.0, retries=1)
     out["trigger after"] = vehicle.parameters["MMAG_UPLOAD"]
