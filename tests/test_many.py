@@ -137,7 +137,7 @@ def killed(undisturbed: Path) -> tuple[Path, list[list[str]]]:
             until = time.monotonic() + WALL_S
             while len(lines(ledger)) < finished and run.poll() is None and time.monotonic() < until:
                 time.sleep(0.02)
-            time.sleep(chance.uniform(0.0, 1.5))
+            time.sleep(chance.uniform(0.0, 0.4))  # a log of these takes about so long
             workers = children(run.pid)
             run.send_signal(signal.SIGKILL)
         while any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers) and time.monotonic() < until:

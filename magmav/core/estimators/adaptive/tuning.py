@@ -98,4 +98,4 @@ class Tuning:
     change_chi2: float = 60.0
     change_disturbance: float = 60.0  # of |d|^2 / sigma^2
     change_nis: float = 12.0  # of single readings, for a second
-    change_hold_s: float = 3.0
+    change_hold_s: float = 1.0  # a magnet on its way is opened for again once it is there
