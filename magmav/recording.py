@@ -231,14 +231,19 @@ def play(
 ) -> None:
     """Every reading through the pipeline, until the end or until ``stop`` says so.
 
-    Where the pipeline is idle and the recording can, attitudes go through it many at once; watchers do not see those.
+    Where the recording can, attitudes go through the pipeline many at once. Watchers see them after that, one by one;
+    those of an idle pipeline do not see them.
     """
     watching: tuple[Watcher, ...] = (keeper, *watchers)
-    for t_ns, reading in recording.in_runs() if pipeline.idle else recording.readings():
+    attitudes_seen_by = () if pipeline.idle else watchers
+    for t_ns, reading in recording.in_runs():
         if not isinstance(reading, MotionRun):
             hand_on(reading, t_ns, pipeline, watching)
         elif pipeline.run(reading):
             keeper.run(reading)
+            for watch in attitudes_seen_by:
+                for _, one in reading.one_by_one():
+                    watch(one, None)
         else:
             for one_ns, one in reading.one_by_one():
                 hand_on(one, one_ns, pipeline, watching)
